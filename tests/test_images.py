@@ -1,0 +1,155 @@
+"""Pictures survive a round trip; damaged ones get an answer."""
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from relit import images
+from relit.conventions import linear_from_srgb
+from relit.errors import EXIT_ENVIRONMENT, UserError
+
+RAMP = np.linspace(0, 1, 6 * 8 * 3, dtype=np.float32).reshape(6, 8, 3)
+
+
+def test_png_is_srgb_and_linear_inside(tmp_path):
+    images.write_srgb(tmp_path / "a.png", RAMP)
+    back = images.read_image(tmp_path / "a.png")
+    assert back.rgb.dtype == np.float32 and back.alpha is None
+    np.testing.assert_allclose(back.rgb, RAMP, atol=0.005)
+    stored = np.asarray(PilImage.open(tmp_path / "a.png"))
+    assert stored[3, 4, 0] > 1.2 * 255 * RAMP[3, 4, 0]  # sRGB codes lie above linear ones
+    assert back.clipped[-1, -1] and not back.clipped[0, 0]
+
+
+def test_data_has_no_curve(tmp_path):
+    images.write_data(tmp_path / "a.png", RAMP[..., 0])
+    back = images.read_data(tmp_path / "a.png")
+    assert back.shape == (6, 8)
+    np.testing.assert_allclose(back, RAMP[..., 0], atol=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_exr_is_exact(tmp_path, channels):
+    array = np.random.default_rng(0).normal(size=(5, 7, channels)).astype(np.float32) * 100
+    images.write_linear(tmp_path / "a.exr", array)
+    np.testing.assert_array_equal(images.read_data(tmp_path / "a.exr").reshape(array.shape), array)
+    header = images.read_header(tmp_path / "a.exr")
+    assert (header.width, header.height, header.alpha) == (7, 5, channels == 4)
+
+
+def test_hdr_round_trip(tmp_path):
+    array = np.random.default_rng(0).uniform(0.5, 30, (4, 9, 3)).astype(np.float32)
+    images.write_linear(tmp_path / "a.hdr", array)
+    back = images.read_image(tmp_path / "a.hdr")
+    assert np.abs(back.rgb - array).max() < 0.01 * array.max()
+    assert images.read_header(tmp_path / "a.hdr").width == 9
+
+
+def test_sixteen_bits_are_kept(tmp_path):
+    import cv2
+
+    codes = np.arange(4 * 5 * 3, dtype=np.uint16).reshape(4, 5, 3) * 3 + 30000
+    cv2.imwrite(str(tmp_path / "a.png"), codes[..., ::-1])
+    np.testing.assert_allclose(images.read_image(tmp_path / "a.png").rgb, linear_from_srgb(codes / np.float32(65535)), rtol=1e-5)
+    assert len(np.unique(images.read_data(tmp_path / "a.png"))) == codes.size
+
+
+def test_alpha_is_composited_on_black_in_linear_light(tmp_path):
+    rgba = np.zeros((2, 2, 4), np.uint8)
+    rgba[..., :3], rgba[..., 3] = 188, 128
+    PilImage.fromarray(rgba).save(tmp_path / "a.png")
+    image = images.read_image(tmp_path / "a.png")
+    np.testing.assert_allclose(image.alpha, 128 / 255)
+    np.testing.assert_allclose(image.rgb, linear_from_srgb(188 / 255) * 128 / 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_applied_once(tmp_path, orientation):
+    """A red upper left corner stays in the upper left corner of the upright picture, whatever the sensor's orientation."""
+    upright = np.zeros((24, 16, 3), np.uint8)
+    upright[:8, :8, 0] = 255
+    stored = {
+        1: upright, 2: upright[:, ::-1], 3: upright[::-1, ::-1], 4: upright[::-1], 5: upright.transpose(1, 0, 2),
+        6: np.rot90(upright, 1), 7: upright[::-1, ::-1].transpose(1, 0, 2), 8: np.rot90(upright, -1),
+    }[orientation]  # fmt: skip
+    exif = PilImage.Exif()
+    exif[0x0112] = orientation
+    PilImage.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "a.jpg", exif=exif, quality=95, subsampling=0)
+    image, header = images.read_image(tmp_path / "a.jpg"), images.read_header(tmp_path / "a.jpg")
+    assert image.rgb.shape == (24, 16, 3) and (header.width, header.height) == (16, 24)
+    assert image.rgb[3, 3, 0] > 0.9 and image.rgb[20, 12, 0] < 0.1 and image.rgb[3, 12, 0] < 0.1 and image.rgb[20, 3, 0] < 0.1
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_sixteen_bit_files_turn_as_eight_bit_ones(tmp_path, orientation):
+    codes = np.random.default_rng(0).integers(0, 255, (5, 7, 3)).astype(np.uint8)
+    wide = images._turned(codes, orientation)
+    exif = PilImage.Exif()
+    exif[0x0112] = orientation
+    PilImage.fromarray(codes).save(tmp_path / "a.png", exif=exif)
+    np.testing.assert_allclose(images.read_image(tmp_path / "a.png").rgb, linear_from_srgb(wide / np.float32(255)), rtol=1e-6)
+
+
+def test_exif_focal_is_the_35mm_equivalent_on_the_diagonal(tmp_path):
+    exif = PilImage.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 26
+    PilImage.fromarray(np.zeros((30, 40, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    assert images.read_header(tmp_path / "a.jpg").focal == pytest.approx(26 * 50 / 43.2666)
+
+
+def test_nan_in_an_exr_is_refused_with_its_place(tmp_path):
+    array = np.ones((4, 5, 3), np.float32)
+    array[2, 3, 1] = np.nan
+    images.write_linear(tmp_path / "a.exr", array)
+    with pytest.raises(UserError, match=r"1 pixels that are NaN or infinite .*column 3, row 2"):
+        images.read_image(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".exr", ".hdr"])
+def test_a_truncated_file_is_refused(tmp_path, suffix):
+    array = np.random.default_rng(0).uniform(size=(64, 64, 3)).astype(np.float32)
+    whole = tmp_path / f"a{suffix}"
+    (images.write_linear if suffix in images.FLOAT else images.write_srgb)(whole, array)
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 3])
+    with pytest.raises(UserError, match="cannot be read"):
+        images.read_image(cut)
+
+
+def test_missing_unknown_and_oversized_files(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="missing"):
+        images.read_image(tmp_path / "none.png")
+    (tmp_path / "a.txt").write_text("no picture")
+    with pytest.raises(UserError, match="not an image format"):
+        images.read_image(tmp_path / "a.txt")
+    images.write_srgb(tmp_path / "a.png", RAMP)
+    monkeypatch.setattr(images, "MAX_PIXELS", 10)
+    with pytest.raises(UserError, match="too large: 8 x 6"):
+        images.read_image(tmp_path / "a.png")
+
+
+def test_layers_of_an_exr(tmp_path):
+    import OpenEXR
+
+    plane = np.full((3, 4), 2, np.float32)
+    channels = {"Depth.Z": plane * 9, **{f"Image.{c}": plane * i for i, c in enumerate("RGB")}}
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as f:
+        f.write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(images.read_image(tmp_path / "a.exr").rgb[0, 0], [0, 2, 4])
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    target = tmp_path / "a.png"
+    images.write_srgb(target, RAMP)
+    before = target.read_bytes()
+    with pytest.raises(UserError):
+        images.write_linear(target, RAMP)
+    assert target.read_bytes() == before and list(tmp_path.iterdir()) == [target]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError) as caught:
+        images.write_srgb(tmp_path / "file" / "a.png", RAMP)
+    assert caught.value.code == EXIT_ENVIRONMENT
+
+
+def test_encoders():
+    assert images.encode_jpeg(RAMP)[:2] == b"\xff\xd8" and images.encode_png(RAMP)[:4] == b"\x89PNG"
