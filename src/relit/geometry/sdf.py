@@ -1,0 +1,165 @@
+"""The signed distance field: a dense grid for look-ups, a narrow band of rows for everything that is optimised.
+
+The grid has n^3 nodes over [-1, 1]^3 (the `unit` frame), node (x, y, z) at flat index (z n + y) n + x, spacing
+h = 2 / (n - 1). Negative inside. Rows exist only for nodes of the band |sdf| < band * h; row 0 belongs to no node and
+collects what falls outside. An optimiser step touches rows, never the whole grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+
+@dataclass
+class SdfGrid:
+    """n: nodes per side. values: Float [n^3], signed distance in unit-frame lengths. index: UInt32 [n^3], row of each node.
+    nodes: UInt32 [rows - 1], node of each row from row 1 on. rows: number of rows, row 0 included.
+    row_values: Float [rows], the optimised copy of `values` on the band. features: Float [rows * channels], packed by row."""
+
+    n: int
+    values: Any
+    index: Any
+    nodes: Any
+    rows: int
+    row_values: Any
+    features: Any
+    channels: int
+
+    @property
+    def h(self) -> float:
+        return 2.0 / (self.n - 1)
+
+
+def make_grid(values: np.ndarray, channels: int, *, band: float, features: np.ndarray | None = None, fill=0.0) -> SdfGrid:
+    """Build a grid from distances (n, n, n) [z, y, x]; `band` in voxels (inf: every node). features: (n, n, n, channels) or None."""
+    n = values.shape[0]
+    h = 2.0 / (n - 1)
+    nodes = np.flatnonzero(np.abs(values.ravel()) < band * h).astype(np.uint32)
+    index = np.zeros(n**3, np.uint32)
+    index[nodes] = np.arange(1, len(nodes) + 1, dtype=np.uint32)
+    rows = len(nodes) + 1
+    row_features = np.empty((rows, channels), np.float32)
+    row_features[:] = np.asarray(fill, np.float32)
+    if features is not None:
+        row_features[1:] = features.reshape(-1, channels)[nodes]
+    row_values = np.concatenate([[1.0], values.ravel()[nodes]]).astype(np.float32)
+    return SdfGrid(
+        n,
+        mi.Float(values.ravel().astype(np.float32)),
+        mi.UInt32(index),
+        mi.UInt32(nodes),
+        rows,
+        mi.Float(row_values),
+        mi.Float(row_features.ravel()),
+        channels,
+    )
+
+
+def write_rows(grid: SdfGrid) -> None:
+    """Copy the optimised row values into the dense grid (band nodes only)."""
+    values = dr.gather(mi.Float, grid.row_values, dr.arange(mi.UInt32, grid.rows - 1) + 1)
+    dr.scatter(grid.values, values, grid.nodes)
+    dr.eval(grid.values)
+
+
+def redistance(values: np.ndarray) -> np.ndarray:
+    """Make (n, n, n) values a distance again, keeping the zero level to sub-voxel accuracy.
+
+    Near the surface the distance is value / |gradient|; farther off, the exact Euclidean transform of the sign.
+    """
+    h = 2.0 / (values.shape[0] - 1)
+    gradient = np.stack(np.gradient(values, h), -1)
+    near = values / np.maximum(np.linalg.norm(gradient, axis=-1), 0.2)
+    inside = values < 0
+    if not inside.any() or inside.all():
+        return values.astype(np.float32)
+    far = (distance_transform_edt(~inside) - distance_transform_edt(inside)) * h
+    far = far - 0.5 * h * np.sign(far)
+    w = np.clip((np.abs(far) / h - 1.5) / 1.5, 0, 1)
+    near = np.clip(near, -3 * h, 3 * h)
+    out = (1 - w) * near + w * far
+    return np.where(inside, np.minimum(out, -1e-4 * h), np.maximum(out, 1e-4 * h)).astype(np.float32)
+
+
+def resample(values: np.ndarray, n: int) -> np.ndarray:
+    """Trilinear resampling of (m, m, m[, C]) node values to n nodes a side over the same cube."""
+    from scipy.ndimage import map_coordinates
+
+    m = values.shape[0]
+    axis = np.arange(n) * ((m - 1) / (n - 1))
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    if values.ndim == 3:
+        return map_coordinates(values, [z, y, x], order=1, mode="nearest").astype(np.float32)
+    return np.stack([map_coordinates(values[..., c], [z, y, x], order=1, mode="nearest") for c in range(values.shape[-1])], -1).astype(
+        np.float32
+    )
+
+
+def node_positions(n: int) -> np.ndarray:
+    """(n, n, n, 3) float32 positions of the nodes, [z, y, x] order, components (x, y, z)."""
+    g = (np.arange(n) / (n - 1) * 2 - 1).astype(np.float32)
+    z, y, x = np.meshgrid(g, g, g, indexing="ij")
+    return np.stack([x, y, z], -1)
+
+
+def dense_values(grid: SdfGrid) -> np.ndarray:
+    """(n, n, n) float32 on the CPU."""
+    return np.array(grid.values).reshape(grid.n, grid.n, grid.n)
+
+
+def row_features(grid: SdfGrid) -> np.ndarray:
+    """(rows, channels) float32 on the CPU."""
+    return np.array(grid.features).reshape(grid.rows, grid.channels)
+
+
+def gather_rows_at(grid: SdfGrid, values: np.ndarray) -> np.ndarray:
+    """Node values (n^3, C) of another field on this grid's rows -> (rows, C); row 0 is zero."""
+    out = np.zeros((grid.rows, values.shape[1]), np.float32)
+    out[1:] = values[np.array(grid.nodes)]
+    return out
+
+
+def smoothness_gradient(grid: SdfGrid, eikonal, laplacian):
+    """Gradient [rows] of mean over the band of eikonal (|∇S| - 1)^2 + laplacian (h ΔS)^2 with respect to the row values.
+
+    eikonal, laplacian: opaque Floats (weights). SfD Eq. (4) E_reg for the first term; the second keeps the level sets smooth.
+    Central differences; nodes at the border of the cube take no part.
+    """
+    n, h = grid.n, grid.h
+    count = grid.rows - 1
+    a = grid.nodes
+    x, y, z = a % n, (a // n) % n, a // (n * n)
+    ok = (x > 0) & (x < n - 1) & (y > 0) & (y < n - 1) & (z > 0) & (z < n - 1)
+    centre = dr.gather(mi.Float, grid.values, a, ok)
+    pairs = [(dr.gather(mi.Float, grid.values, a + k, ok), dr.gather(mi.Float, grid.values, a - k, ok), k) for k in (1, n, n * n)]
+    g = [(p - m) / (2 * h) for p, m, _ in pairs]
+    norm = dr.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    ke = eikonal * (2.0 / count) * (1 - 1 / dr.maximum(norm, 0.05))
+    lap = pairs[0][0] + pairs[0][1] + pairs[1][0] + pairs[1][1] + pairs[2][0] + pairs[2][1] - 6 * centre
+    kl = laplacian * (2.0 / (count * h * h)) * lap
+    out = dr.zeros(mi.Float, grid.rows)
+    for c, (_, _, k) in enumerate(pairs):
+        e = ke * g[c] / (2 * h)
+        dr.scatter_add(out, kl + e, dr.gather(mi.UInt32, grid.index, a + k, ok), ok, mode=dr.ReduceMode.Direct)
+        dr.scatter_add(out, kl - e, dr.gather(mi.UInt32, grid.index, a - k, ok), ok, mode=dr.ReduceMode.Direct)
+    dr.scatter_add(out, -6 * kl, dr.arange(mi.UInt32, count) + 1, ok, mode=dr.ReduceMode.Direct)
+    return out
+
+
+def smoothness_energy(grid: SdfGrid, eikonal: float, laplacian: float) -> float:
+    """The energy whose gradient `smoothness_gradient` returns (NumPy, for tests and reports)."""
+    v, h = dense_values(grid).astype(np.float64), grid.h
+    c = v[1:-1, 1:-1, 1:-1]
+    sides = [(np.roll(v, -1, k)[1:-1, 1:-1, 1:-1], np.roll(v, 1, k)[1:-1, 1:-1, 1:-1]) for k in (0, 1, 2)]
+    norm = np.sqrt(sum(((p - m) / (2 * h)) ** 2 for p, m in sides))
+    lap = (sum(p + m for p, m in sides) - 6 * c) / h
+    band = np.zeros(grid.n**3, bool)
+    band[np.array(grid.nodes)] = True
+    band = band.reshape(v.shape)[1:-1, 1:-1, 1:-1]
+    return float((eikonal * (norm - 1) ** 2 + laplacian * lap**2)[band].sum() / (grid.rows - 1))
