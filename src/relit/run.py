@@ -1,0 +1,313 @@
+"""A run folder: what a long job leaves behind, and how it goes on after it was stopped.
+
+RUN/ config.toml  inputs.json  log.txt  metrics.jsonl  stages/<name>/{DONE, *.npz}  previews/*.jpg
+`DONE` is written last, so a stage either is complete or is taken up again from its newest checkpoint. Nothing in the
+folder is an absolute path. One process at a time holds the folder; the kernel drops the lock when that process dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import math
+import os
+import shutil
+import signal
+import time
+import weakref
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from relit.errors import EXIT_USAGE, UserError
+from relit.files import disk_errors, load_arrays, read_json, save_arrays, toml_text, write_text
+from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_seconds
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib
+
+CHECKPOINT_SECONDS = 20.0  # a checkpoint is due this long after the last one, later if writing one is slow
+CHECKPOINT_LONGEST = 60.0  # ... but never later than this
+METRICS_SECONDS = 0.5  # between two lines of metrics.jsonl
+OWNED = ("config.toml", "inputs.json", "log.txt", "metrics.jsonl", "stages", "previews", "asset", "report.html")
+
+
+class Terminated(BaseException):
+    """SIGTERM, raised in the main thread so that files are closed and the lock is dropped."""
+
+
+class Run:
+    """One run folder, held by this process. Make it with `Run.open`; it is a context manager."""
+
+    def __init__(self, folder: Path, config: dict, lock: int, log: Log):
+        self.folder, self.config, self.log = folder, config, log
+        self._unlock = weakref.finalize(self, os.close, lock)
+
+    @staticmethod
+    def open(folder: str | Path, config: dict, *, resume: bool = True, inputs: dict[str, str] | None = None) -> Run:
+        """Make the run folder, or take it up again.
+
+        config: what decides the result; strings, numbers, booleans, lists and one level of tables (saved as config.toml).
+        inputs: {name: digest} from `digests`; a file that changed since the run was begun is an error.
+        resume: False removes what an earlier run left in the folder (only files that a run makes).
+        Raises UserError when the folder holds something else, another process has it, or its settings or inputs differ.
+        """
+        folder = Path(folder)
+        wanted = tomllib.loads(toml_text(config))
+        with disk_errors(folder):
+            _refuse_foreign(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = _lock(folder)
+            try:
+                if not resume:
+                    _remove_owned(folder)
+                _compare(folder, wanted, inputs)
+                if not (folder / "config.toml").exists():
+                    write_text(folder / "config.toml", toml_text(config))
+                if inputs is not None and not (folder / "inputs.json").exists():
+                    write_text(folder / "inputs.json", json.dumps(inputs, indent=1, sort_keys=True) + "\n")
+                _end_line(folder / "metrics.jsonl")
+            except BaseException:
+                os.close(lock)
+                raise
+        return Run(folder, wanted, lock, Log(folder / "log.txt"))
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let another process have the folder."""
+        self._unlock()
+
+    def say(self, text: str) -> None:
+        """One log line, on stderr and in log.txt."""
+        self.log.say(text)
+
+    def done(self, stage: str) -> bool:
+        """Did this stage run to its end, now or in an earlier process?"""
+        return read_json(self.folder / "stages" / stage / "DONE") is not None
+
+    @contextlib.contextmanager
+    def stage(self, name: str, *, steps: int | None = None, title: str | None = None) -> Iterator[Stage]:
+        """Run one stage: progress, seconds and peak memory; DONE on a clean exit.
+
+        steps: number of steps that `Stage.step` will report, or None. title: what the reader sees (else the name).
+        """
+        stage = Stage(self, name, title or name, steps)
+        self.log.note(f"{stage.title}: begun" if stage.earlier == 0 else f"{stage.title}: taken up again")
+        watch = MemoryWatch().start()
+        try:
+            with disk_errors(self.folder):
+                yield stage
+        except BaseException as error:
+            watch.stop()
+            self.log.clear()
+            with contextlib.suppress(OSError):
+                self.log.note(f"{stage.title}: stopped by {type(error).__name__} after {readable_seconds(stage.seconds)}")
+            raise
+        peak = watch.stop()
+        record = {"name": name, "title": stage.title, "seconds": round(stage.seconds, 3), "peak_memory": peak, "ended": time.time()}
+        with disk_errors(self.folder):
+            write_text(stage.folder / "DONE", json.dumps(record) + "\n")
+        self.say(f"{stage.title}: {readable_seconds(stage.seconds)}, peak memory {readable_bytes(peak)}")
+
+    def stages(self) -> list[dict]:
+        """The finished stages in the order in which they ended: name, title, seconds, peak_memory (bytes)."""
+        records = [read_json(p) for p in (self.folder / "stages").glob("*/DONE")]
+        return sorted((r for r in records if r), key=lambda r: r["ended"])
+
+    def metrics(self) -> list[dict]:
+        """The lines of metrics.jsonl; steps that were repeated after a resume appear once, a torn last line is left out."""
+        return read_metrics(self.folder)
+
+
+class Stage:
+    """What a stage may do with its run. `folder`: RUN/stages/<name>."""
+
+    def __init__(self, run: Run, name: str, title: str, steps: int | None):
+        self.run, self.name, self.title, self.steps = run, name, title, steps
+        self.folder = run.folder / "stages" / name
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.earlier = float((read_json(self.folder / "time.json") or {}).get("seconds", 0.0))  # of stopped processes
+        self._begun = self._saved = time.monotonic()
+        self._written = -math.inf
+        self._interval = CHECKPOINT_SECONDS
+        self._progress = Progress(run.log, title, steps)
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in this stage, that of earlier processes up to their last checkpoint included."""
+        return self.earlier + time.monotonic() - self._begun
+
+    def step(self, i: int, /, **losses: float | Callable[[], float]) -> None:
+        """Tell that step `i` (from 0) is over. A loss given as a callable is evaluated only when a line is written."""
+        now = time.monotonic()
+        values: dict[str, float] = {}
+        if losses and (now - self._written >= METRICS_SECONDS or i + 1 == self.steps):
+            values = {key: float(v() if callable(v) else v) for key, v in losses.items()}
+            self._written = now
+            record = {"stage": self.name, "step": i, "seconds": round(self.seconds, 3), **{k: _finite(v) for k, v in values.items()}}
+            with (self.run.folder / "metrics.jsonl").open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
+        self._progress.update(i + 1, values)
+
+    def checkpoint_due(self) -> bool:
+        """True when the last checkpoint (or the beginning) is 20 s ago; up to 60 s where writing one takes long."""
+        return time.monotonic() - self._saved >= self._interval
+
+    def save(self, name: str, /, **arrays) -> None:
+        """Write arrays to <name>.npz in the stage's folder, atomically. Anything `np.asarray` takes, but no objects."""
+        begun = time.monotonic()
+        with disk_errors(self.run.folder):
+            save_arrays(self.folder / f"{name}.npz", arrays)
+            write_text(self.folder / "time.json", json.dumps({"seconds": round(self.seconds, 3)}))
+        self._saved = time.monotonic()
+        self._interval = min(max(CHECKPOINT_SECONDS, 10 * (self._saved - begun)), CHECKPOINT_LONGEST)
+
+    def load(self, name: str) -> dict[str, np.ndarray] | None:
+        """The arrays of <name>.npz, or None if there is none or it cannot be read (then a line says so)."""
+        path = self.folder / f"{name}.npz"
+        if not path.exists():
+            return None
+        try:
+            return load_arrays(path)
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            self.run.say(f"checkpoint {name} of stage {self.name} cannot be read and is left out ({type(error).__name__}): {path}")
+            return None
+
+    def preview(self, name: str, linear_rgb: np.ndarray) -> None:
+        """Write a linear (H, W, 3) picture to previews/<stage>_<name>.jpg."""
+        from relit.images import write_srgb
+
+        folder = self.run.folder / "previews"
+        folder.mkdir(exist_ok=True)
+        write_srgb(folder / f"{self.name}_{name}.jpg", linear_rgb)
+
+
+def read_metrics(folder: Path) -> list[dict]:
+    """The lines of RUN/metrics.jsonl, see `Run.metrics`."""
+    path = Path(folder) / "metrics.jsonl"
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    out: list[dict] = []
+    for line in lines:
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(record, dict) and "stage" in record and "step" in record:
+            while out and out[-1]["stage"] == record["stage"] and out[-1]["step"] >= record["step"]:
+                out.pop()
+            out.append(record)
+    return out
+
+
+# ---------------------------------------------------------------- stopping, holding, comparing
+
+
+@contextlib.contextmanager
+def termination() -> Iterator[None]:
+    """While inside, SIGTERM raises `Terminated` in the main thread."""
+
+    def stop(*_):
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _refuse_foreign(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise UserError("the output is a file, not a folder", fix=f"give another -o: {folder}")
+    if folder.is_dir() and not (folder / "config.toml").exists() and any(p.name != "lock" for p in folder.iterdir()):
+        what = "the output folder is not empty and is no Relit run"
+        raise UserError(what, "nothing was overwritten", f"give a new folder with -o: {folder}")
+
+
+def _lock(folder: Path) -> int:
+    handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        owner = os.read(handle, 32).decode("ascii", "replace").strip()
+        os.close(handle)
+        raise UserError(
+            f"another process works in this run folder (process {owner or 'unknown'})",
+            "two jobs in one folder would overwrite each other",
+            f"wait for it, stop it (kill {owner or 'PID'}), or use another -o: {folder}",
+        ) from None
+    except OSError:
+        return handle  # a file system without locks: work without one
+    os.ftruncate(handle, 0)
+    os.pwrite(handle, str(os.getpid()).encode(), 0)
+    return handle
+
+
+def _remove_owned(folder: Path) -> None:
+    for name in OWNED:
+        path = folder / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _compare(folder: Path, wanted: dict, inputs: dict[str, str] | None) -> None:
+    path = folder / "config.toml"
+    if not path.exists():
+        return
+    try:
+        saved = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"the run's config.toml cannot be read: {error}", fix=f"use another -o, or --overwrite: {path}") from None
+    a, b = _flat(saved), _flat(wanted)
+    keys = [k for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)]
+    if keys:
+        said = ", ".join(f"{k} was {_shown(a.get(k))}, is now {_shown(b.get(k))}" for k in keys)
+        raise UserError(
+            f"the folder holds a run with other settings: {said}",
+            "a run is resumed with the settings it was begun with; nothing was overwritten",
+            f"use another -o, the old settings, or --overwrite to begin anew: {folder}",
+            code=EXIT_USAGE,
+        )
+    before = read_json(folder / "inputs.json")
+    if inputs is not None and before is not None and before != inputs:
+        changed = [k for k in dict.fromkeys([*before, *inputs]) if before.get(k) != inputs.get(k)]
+        listed = ", ".join(changed[:5]) + (" ..." if len(changed) > 5 else "")
+        raise UserError(
+            f"{len(changed)} input files are not the ones this run was begun with: {listed}",
+            "photos were replaced, added or removed; what was computed from the old ones would not fit",
+            f"use another -o, or --overwrite to begin anew: {folder}",
+        )
+
+
+def _shown(value) -> str:
+    return "not set" if value is None else repr(value)
+
+
+def _flat(config: dict) -> dict:
+    out = {}
+    for key, value in config.items():
+        out.update({f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value})
+    return out
+
+
+def _end_line(path: Path) -> None:
+    """A killed process may have left half a line: end it, so that the next one stands alone."""
+    if path.exists() and path.stat().st_size and not path.read_bytes().endswith(b"\n"):
+        with path.open("ab") as file:
+            file.write(b"\n")
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None  # JSON has no NaN
