@@ -1,0 +1,59 @@
+"""Vertex normals and tangents of a mesh, in NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from relit.scene import Mesh
+
+
+def _unit(x):
+    """(N, 3) -> unit rows; zero rows become +Z."""
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.where(length > 1e-20, x / np.maximum(length, 1e-20), np.array([0.0, 0.0, 1.0]))
+
+
+def vertex_normals(mesh: Mesh) -> np.ndarray:
+    """(V, 3) float32 unit normals weighted by corner angles; vertices at one position (a UV seam) share their normal."""
+    v, f = np.asarray(mesh.vertices, np.float64), mesh.faces
+    _, ident = np.unique(np.ascontiguousarray(mesh.vertices, np.float32), axis=0, return_inverse=True)
+    ident = ident.reshape(-1)
+    corners = v[f]  # [F, 3, 3]
+    face = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    total = np.zeros((ident.max(initial=-1) + 1, 3))
+    for k in range(3):
+        a, b = _unit(corners[:, (k + 1) % 3] - corners[:, k]), _unit(corners[:, (k + 2) % 3] - corners[:, k])
+        angle = np.arccos(np.clip((a * b).sum(-1), -1, 1))
+        np.add.at(total, ident[f[:, k]], face * angle[:, None])
+    return _unit(total)[ident].astype(np.float32)
+
+
+def vertex_tangents(mesh: Mesh) -> np.ndarray:
+    """(V, 4) float32 tangents as glTF has them: xyz along +u, orthogonal to the normal; w = +1 or -1 so that
+    w * cross(normal, xyz) points UP in the texture (against v, whose zero is the top row).
+
+    Averaged over the faces of a vertex, weighted by angle. Where the UVs are degenerate any orthogonal direction stands in.
+    """
+    v, f, uv = np.asarray(mesh.vertices, np.float64), mesh.faces, np.asarray(mesh.uvs, np.float64)
+    n = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64)
+    corners, st = v[f], uv[f]
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    d1, d2 = st[:, 1] - st[:, 0], st[:, 2] - st[:, 0]
+    det = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    sign = np.sign(det)[:, None]
+    dp_du = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * sign  # direction only
+    dp_dv = (e2 * d1[:, :1] - e1 * d2[:, :1]) * sign
+    length_u, length_v = np.linalg.norm(dp_du, axis=-1, keepdims=True), np.linalg.norm(dp_dv, axis=-1, keepdims=True)
+    dp_du, dp_dv = dp_du / np.maximum(length_u, 1e-30), dp_dv / np.maximum(length_v, 1e-30)
+    along_u, along_v = np.zeros_like(v), np.zeros_like(v)
+    for k in range(3):
+        a, b = _unit(corners[:, (k + 1) % 3] - corners[:, k]), _unit(corners[:, (k + 2) % 3] - corners[:, k])
+        angle = np.arccos(np.clip((a * b).sum(-1), -1, 1))[:, None]
+        np.add.at(along_u, f[:, k], dp_du * angle)
+        np.add.at(along_v, f[:, k], dp_dv * angle)
+    t = along_u - n * (n * along_u).sum(-1, keepdims=True)
+    lost = np.linalg.norm(t, axis=-1) < 1e-8
+    axis = np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    t = _unit(np.where(lost[:, None], axis - n * (n * axis).sum(-1, keepdims=True), t))
+    w = np.where((np.cross(n, t) * along_v).sum(-1) > 0, -1.0, 1.0)
+    return np.concatenate([t, w[:, None]], -1).astype(np.float32)

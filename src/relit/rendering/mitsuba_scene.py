@@ -1,0 +1,195 @@
+"""Reference renderings by Mitsuba 3: full path tracing of a mesh with a metallic-roughness material under an environment map.
+
+The only file that knows Mitsuba's parameter names. Camera rays are made here from opaque parameters, so one compiled kernel
+serves every view of a scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.conventions import scale_of
+from relit.errors import UserError
+from relit.geometry.tangents import vertex_normals, vertex_tangents
+from relit.rendering import bsdf as relit_bsdf
+from relit.scene import Camera, Material, Mesh
+
+RAYS_PER_PASS = 1 << 21  # bounds the memory of a pass: about 50 bytes a ray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What `build_scene` returns. mi_scene: the Mitsuba scene in the world frame. textures: Mitsuba textures by name
+    (base_color, roughness, metallic, specular, normalmap; the last two may be None). integrators: Mitsuba integrators by maximal depth, made on demand."""
+
+    mi_scene: Any
+    textures: dict
+    integrators: dict
+
+
+def _texture(array, *, color=False):
+    """Mitsuba texture (float32, no transfer curve) of an (H, W) or (H, W, 3) array with row 0 at v = 0."""
+    a = np.asarray(array, np.float32)
+    a = a[..., None] if a.ndim == 2 else a
+    if color and a.shape[2] == 1:
+        a = np.repeat(a, 3, 2)
+    return mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(a)), "raw": True, "format": "variant", "filter_type": "bilinear", "wrap_mode": "repeat"})
+
+
+def environment_bitmap(environment):
+    """Lat-long map (H, W, 3) -> the (2H + 1, W, 3) map whose interpolation by Mitsuba equals `conventions.sample_environment`.
+
+    Mitsuba puts the first and the last row AT the poles, Relit puts texel centres at (row + .5) / H. Rows at every multiple of
+    half a texel make both the same piecewise linear function.
+    """
+    e = np.asarray(environment, np.float32)
+    out = np.empty((2 * e.shape[0] + 1, *e.shape[1:]), np.float32)
+    out[1::2] = e
+    out[2:-1:2] = 0.5 * (e[1:] + e[:-1])
+    out[0], out[-1] = e[0], e[-1]
+    return out
+
+
+def _mesh(mesh: Mesh, world_from_asset, bsdf, with_tangents: bool):
+    m = np.asarray(world_from_asset, np.float64)
+    rotation = m[:3, :3] / scale_of(m)
+    normals = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64) @ rotation.T
+    props = mi.Properties()
+    props["mesh_bsdf"] = bsdf
+    out = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), props, True, mesh.uvs is not None)
+    p = mi.traverse(out)
+    p["vertex_positions"] = mi.Float((np.asarray(mesh.vertices, np.float64) @ m[:3, :3].T + m[:3, 3]).astype(np.float32).ravel())
+    p["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
+    if mesh.uvs is not None:
+        p["vertex_texcoords"] = mi.Float(np.asarray(mesh.uvs, np.float32).ravel())
+    p["faces"] = mi.UInt32(np.asarray(mesh.faces, np.uint32).ravel())
+    p.update()
+    if with_tangents:
+        t = vertex_tangents(mesh)
+        out.add_attribute("vertex_tangent", 3, (t[:, :3].astype(np.float64) @ rotation.T).astype(np.float32).ravel())
+        out.add_attribute("vertex_handedness", 1, np.ascontiguousarray(t[:, 3]))
+    return out
+
+
+def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environment=None, *, bsdf: str = "relit") -> Scene:
+    """A Mitsuba scene in the world frame.
+
+    world_from_asset: (4, 4) similarity or None for the identity. environment: (H, W, 3) lat-long radiance in the world frame, or None for
+    darkness. bsdf: 'relit' (materials.brdf, what fits use) or 'principled' (Mitsuba's own, for ground truth that Relit did not write).
+    """
+    if bsdf not in ("relit", "principled"):
+        raise UserError(f"unknown bsdf '{bsdf}'", fix="choose relit or principled", code=2)
+    if material.normal is not None and mesh.uvs is None:
+        raise UserError("the material has a normal map but the mesh has no texture coordinates", fix="give the mesh uvs, or drop the normal map")
+    t = {
+        "base_color": _texture(material.base_color, color=True),
+        "roughness": _texture(material.roughness),
+        "metallic": _texture(material.metallic),
+        "specular": None if material.specular is None else _texture(material.specular, color=True),
+        "normalmap": None if material.normal is None else _texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),
+    }
+    if bsdf == "relit":
+        d = {"type": relit_bsdf.register(), "int_ior": float(material.ior), **{k: v for k, v in t.items() if v is not None}}
+    else:
+        if material.specular is not None:
+            raise UserError("Mitsuba's principled BSDF takes no specular map", fix="use bsdf='relit'")
+        d = {"type": "principled", "eta": float(material.ior), **{k: t[k] for k in ("base_color", "roughness", "metallic")}}
+        if t["normalmap"] is not None:
+            d = {"type": "normalmap", "normalmap": t["normalmap"], "bsdf": d}
+        d = {"type": "twosided", "bsdf": d}
+    scene = {"type": "scene", "object": _mesh(mesh, np.eye(4) if world_from_asset is None else world_from_asset, mi.load_dict(d), t["normalmap"] is not None)}
+    if environment is not None:
+        scene["environment"] = {"type": "envmap", "bitmap": mi.Bitmap(environment_bitmap(environment))}
+    return Scene(mi.load_dict(scene), t, {})
+
+
+def _camera_rays(camera: Camera, sampler, count: int):
+    """`count` rays (sample-major: pixel = index mod W * H) through uniformly jittered positions (a box filter), in the world frame;
+    also the cosine to the optical axis, which turns distance into depth."""
+    if camera.distortion and np.any(np.asarray(camera.distortion)):
+        raise UserError("a camera with lens distortion cannot be rendered", "reference pictures are pinhole pictures", "undistort the camera first")
+    pixels = camera.width * camera.height
+    index = dr.arange(mi.UInt32, count) % pixels
+    jitter = sampler.next_2d()
+    o = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731  values that change per view must not become literals
+    x = (mi.Float(index % camera.width) + jitter.x - o(camera.cx)) / o(camera.fx)
+    y = (mi.Float(index // camera.width) + jitter.y - o(camera.cy)) / o(camera.fy)
+    m = [[o(v) for v in row] for row in np.asarray(camera.world_from_camera, np.float64)[:3]]
+    inv = dr.rsqrt(dr.fma(x, x, dr.fma(y, y, 1)))
+    d = mi.Vector3f(*[(r[0] * x + r[1] * y + r[2]) * inv for r in m])
+    return mi.RayDifferential3f(mi.Point3f(m[0][3], m[1][3], m[2][3]), dr.normalize(d)), inv
+
+
+def _passes(camera: Camera, spp: int, seed: int):
+    """(sampler, samples per pixel) of each pass of a rendering, with the memory of one pass bounded."""
+    pixels = camera.width * camera.height
+    per_pass = max(1, min(spp, RAYS_PER_PASS // pixels))
+    done = k = 0
+    while done < spp:
+        n = min(per_pass, spp - done)
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(dr.opaque(mi.UInt32, (seed * 9973 + k) & 0xFFFFFFFF), n * pixels)
+        yield sampler, n
+        done, k = done + n, k + 1
+
+
+def render(scene: Scene, camera: Camera, *, spp: int, seed: int = 0, max_depth: int = 6) -> np.ndarray:
+    """(H, W, 4) float32: linear radiance premultiplied on black, and alpha. Box filter; the environment lights but is not seen.
+
+    max_depth: longest path in edges (2 = direct light only, 6 = four inter-reflections). Not differentiable.
+    """
+    if max_depth not in scene.integrators:
+        scene.integrators[max_depth] = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True})
+    integrator, pixels = scene.integrators[max_depth], camera.width * camera.height
+    total = np.zeros((pixels, 4))
+    with dr.suspend_grad():
+        for sampler, n in _passes(camera, spp, seed):
+            ray, _ = _camera_rays(camera, sampler, n * pixels)
+            color, hit, _ = integrator.sample(scene.mi_scene, sampler, ray)
+            rgba = [*color, dr.select(hit, mi.Float(1), 0)]
+            dr.eval(rgba)
+            for c in range(4):
+                total[:, c] += np.asarray(rgba[c].numpy(), np.float32).reshape(n, pixels).sum(0, dtype=np.float64)
+    out = total / spp
+    return np.where(np.isfinite(out), out, 0).reshape(camera.height, camera.width, 4).astype(np.float32)
+
+
+def render_channels(scene: Scene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, np.ndarray]:
+    """Material and geometry as the camera sees them, means over the covered part of each pixel, 0 where nothing is hit.
+
+    albedo: (H, W, 3) linear base colour. roughness, metallic: (H, W). normal: (H, W, 3) unit shading normals in the WORLD frame.
+    depth: (H, W) along the optical axis in world units. alpha: (H, W) coverage.
+    """
+    pixels = camera.width * camera.height
+    total = np.zeros((pixels, 10))
+    t = scene.textures
+    with dr.suspend_grad():
+        for sampler, n in _passes(camera, spp, seed):
+            ray, cos = _camera_rays(camera, sampler, n * pixels)
+            si = scene.mi_scene.ray_intersect(ray)
+            hit = si.is_valid()
+            normal = si.to_world(mi.Vector3f(relit_bsdf.shading_normal(si, t["normalmap"], hit)))
+            base = mi.Color3f(t["base_color"].eval(si, hit))
+            values = [*base, t["roughness"].eval_1(si, hit), t["metallic"].eval_1(si, hit), *normal, si.t * cos, mi.Float(1)]
+            values = [dr.select(hit, v, 0) for v in values]
+            dr.eval(values)
+            for c, v in enumerate(values):
+                total[:, c] += v.numpy().reshape(n, pixels).sum(0, dtype=np.float64)
+    count = np.maximum(total[:, 9:], 1e-9)
+    mean = (total / count).reshape(camera.height, camera.width, 10).astype(np.float32)
+    normal = mean[..., 5:8]
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    alpha = (total[:, 9] / spp).reshape(camera.height, camera.width).astype(np.float32)
+    return {
+        "albedo": mean[..., :3],
+        "roughness": mean[..., 3],
+        "metallic": mean[..., 4],
+        "normal": normal / np.maximum(length, 1e-9),
+        "depth": mean[..., 8],
+        "alpha": alpha,
+    }
