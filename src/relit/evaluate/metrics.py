@@ -1,0 +1,152 @@
+"""Every figure that Relit reports, in NumPy, each with the definition it is printed with.
+
+Papers differ by up to 2 dB in what they call the same figure (mask, colour space, scale, window), so nothing here has a
+hidden choice: `DEFINITIONS` holds the sentence that stands beside each number.
+
+Images are (H, W, 3) float32 linear, premultiplied on black. A picture figure is taken after clipping to [0, 1] and sRGB
+encoding, in two conventions: over the whole frame (black outside the object; easy background pixels raise it) and inside the
+mask (truth coverage >= MASK; strict).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+
+from relit.conventions import environment_solid_angles, srgb_from_linear
+
+MASK = 0.99  # truth coverage from which a pixel counts as inside: rims mix object and background
+SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # an 11 x 11 window, as Wang et al. 2004 and PIR
+
+DEFINITIONS = {
+    "psnr": "PSNR in dB of sRGB-encoded pictures clipped to [0, 1], peak 1, whole frame on black; mean over views of the per-view figure",
+    "psnr_masked": f"as psnr, over the pixels whose truth coverage is >= {MASK}",
+    "ssim": "SSIM (Wang 2004: Gaussian window 11x11, sigma 1.5, K = .01, .03) of the sRGB-encoded pictures, mean of 3 channels, "
+    "whole frame on black",
+    "ssim_masked": f"the SSIM map of the pictures on black, averaged over pixels whose truth coverage is >= {MASK}",
+    "mae": f"angle in degrees between predicted and true world shading normals, mean over pixels with truth coverage >= {MASK}; "
+    "a pixel without a prediction counts 90",
+    "mse": f"mean squared error over pixels with truth coverage >= {MASK}; a pixel without a prediction counts as value 0",
+}
+
+
+def encode(linear):
+    """Linear -> sRGB clipped to [0, 1], what every picture figure is taken on."""
+    return srgb_from_linear(np.clip(linear, 0.0, 1.0))
+
+
+def psnr(a, b, where=None, peak: float = 1.0) -> float:
+    """Peak signal-to-noise ratio in dB of two arrays in the space they are given in.
+
+    where: (H, W) bool, the pixels that count, or None for all. Equal arrays give 100, the largest figure returned;
+    no pixel at all gives nan.
+    """
+    error = np.square(np.asarray(a, np.float64) - np.asarray(b, np.float64))
+    if where is not None:
+        error = error[np.asarray(where, bool)]
+    if error.size == 0:
+        return float("nan")
+    return float(min(100.0, 10 * np.log10(peak**2 / max(error.mean(), 1e-12))))
+
+
+def ssim_map(a, b) -> np.ndarray:
+    """Structural similarity (H, W) of two (H, W) or (H, W, C) arrays in [0, 1], mean over channels.
+
+    Wang et al. 2004, Eq. 13: Gaussian window of 11 x 11 pixels with sigma 1.5, C1 = .01^2, C2 = .03^2, population moments,
+    frame edges reflected.
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if a.ndim == 2:
+        a, b = a[..., None], b[..., None]
+
+    def blur(x):
+        return gaussian_filter(x, (SSIM_SIGMA, SSIM_SIGMA, 0), radius=(SSIM_RADIUS, SSIM_RADIUS, 0), mode="reflect")
+
+    mu_a, mu_b = blur(a), blur(b)
+    var_a, var_b, cov = blur(a * a) - mu_a**2, blur(b * b) - mu_b**2, blur(a * b) - mu_a * mu_b
+    c1, c2 = 0.01**2, 0.03**2
+    s = ((2 * mu_a * mu_b + c1) * (2 * cov + c2)) / ((mu_a**2 + mu_b**2 + c1) * (var_a + var_b + c2))
+    return s.mean(-1)
+
+
+def ssim(a, b, where=None) -> float:
+    """Mean of `ssim_map`, over `where` (H, W) bool if given."""
+    s = ssim_map(a, b)
+    return float(s.mean() if where is None else s[np.asarray(where, bool)].mean())
+
+
+def normal_angles(predicted, truth) -> np.ndarray:
+    """Angle (...) in degrees between (..., 3) normals, normalised first; 90 where the prediction is zero (no surface there)."""
+    p, t = np.asarray(predicted, np.float64), np.asarray(truth, np.float64)
+    length = np.linalg.norm(p, axis=-1)
+    t = t / np.maximum(np.linalg.norm(t, axis=-1, keepdims=True), 1e-12)
+    p = p / np.maximum(length, 1e-12)[..., None]
+    # atan2 keeps the precision near 0 that arccos of a float32 dot product loses
+    angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(p, t), axis=-1), (p * t).sum(-1)))
+    return np.where(length < 1e-6, 90.0, angle)
+
+
+def albedo_scale(predicted, truth) -> np.ndarray:
+    """Per-channel factor (3,) that takes the predicted albedo to the true one: sum(truth) / sum(predicted) over (N, 3) linear
+    samples (SfD's evaluation, there in gamma space). Albedo and light share a scale that photographs cannot settle."""
+    p, t = np.asarray(predicted, np.float64).reshape(-1, 3), np.asarray(truth, np.float64).reshape(-1, 3)
+    total = p.sum(0)
+    return np.where(total > 1e-9, t.sum(0) / np.maximum(total, 1e-9), 1.0)
+
+
+def chamfer(a, b) -> tuple[float, float, float]:
+    """(mean of the two, a to b, b to a): mean distance from each point of a (N, 3) to its nearest in b (M, 3) and back, in the
+    points' unit. Not squared."""
+    to_b = float(cKDTree(b).query(a, workers=-1)[0].mean())
+    to_a = float(cKDTree(a).query(b, workers=-1)[0].mean())
+    return 0.5 * (to_a + to_b), to_b, to_a
+
+
+def sample_surface(vertices, faces, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """`count` points (N, 3) float64 uniform by area on a triangle mesh, and the unit face normals (N, 3) there."""
+    v, f = np.asarray(vertices, np.float64), np.asarray(faces)
+    e1, e2 = v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]
+    cross = np.cross(e1, e2)
+    area = np.linalg.norm(cross, axis=1)
+    rng = np.random.default_rng(seed)
+    # stratified over the cumulated area: less noise in a distance between samples than independent draws
+    position = (np.arange(count) + rng.random(count)) / count * area.sum()
+    index = np.minimum(np.searchsorted(np.cumsum(area), position), len(f) - 1)
+    u, w = rng.random(count), rng.random(count)
+    flip = u + w > 1
+    u, w = np.where(flip, 1 - u, u), np.where(flip, 1 - w, w)
+    points = v[f[index, 0]] + u[:, None] * e1[index] + w[:, None] * e2[index]
+    return points, cross[index] / np.maximum(area[index], 1e-30)[:, None]
+
+
+def resize_environment(environment, height: int = 256, width: int = 512) -> np.ndarray:
+    """Lat-long map (H, W, 3) resampled to height x width: area average where it shrinks, bilinear where it grows."""
+    import cv2
+
+    e = np.ascontiguousarray(environment, np.float32)
+    shrink = e.shape[0] >= height and e.shape[1] >= width
+    return cv2.resize(e, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
+
+
+def environment_mse(predicted, truth) -> float:
+    """SfD's figure: MSE of two lat-long maps resampled to 256 x 512, clipped to [0, 1] and raised to 1/2.2, every texel alike."""
+    p, t = (np.clip(resize_environment(e), 0, 1) ** (1 / 2.2) for e in (predicted, truth))
+    return float(np.mean((p - t) ** 2))
+
+
+def environment_log_rmse(predicted, truth) -> float:
+    """Root mean square of the difference of log2 radiance (in stops), per solid angle, at 32 x 64, radiance below 1 % of the truth's
+    mean raised to that. Unlike the clipped figure it sees the strength of lamps and the sun."""
+    p, t = (resize_environment(e, 32, 64).astype(np.float64) for e in (predicted, truth))
+    weight = environment_solid_angles(32, 64)[..., None]
+    floor = 0.01 * (t * weight).sum() / (3 * weight.sum())
+    d = np.log2(np.maximum(p, floor)) - np.log2(np.maximum(t, floor))
+    return float(np.sqrt((d**2 * weight).sum() / (3 * weight.sum())))
+
+
+def mask_iou(a, b) -> float:
+    """Intersection over union of two coverages (H, W), each cut at one half."""
+    a, b = np.asarray(a) >= 0.5, np.asarray(b) >= 0.5
+    union = (a | b).sum()
+    return float((a & b).sum() / union) if union else float("nan")
