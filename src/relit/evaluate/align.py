@@ -76,5 +76,3 @@ def same_frame(recovered: dict[str, Camera], truth: dict[str, Camera]) -> bool:
     centres = np.array([truth[n].centre for n in names])
     spread = np.linalg.norm(centres - centres.mean(0), axis=1).mean()
     return bool(np.median(rotations) < 5.0 and np.median(distances) <= 0.05 * max(spread, 1e-12))
-
-

@@ -1,0 +1,354 @@
+"""What is measured on a reconstructed asset against the truth of a synthetic capture, and how each figure is defined.
+
+The truth folder is what `relit synthesize` writes (`capture/synthetic.py`). Pictures are rendered by the same path tracer as the truth.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from relit.conventions import move_points, rotate_environment, world_from_cv_camera
+from relit.errors import UserError
+from relit.evaluate import metrics as m
+from relit.evaluate.align import align_cameras, pose_errors, same_frame
+from relit.scene import Asset, Camera, Material, Mesh
+
+SURFACE_SAMPLES = 100_000  # points per mesh for the Chamfer distance
+ROUNDTRIP_VIEWS = 3
+
+SCALE = "one factor per channel on the linear base colour, sum(truth) / sum(predicted) over the object's pixels of a few TRAINING views"
+DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
+    "novel_psnr": ("dB", f"test views under the recovered light: {m.DEFINITIONS['psnr']}"),
+    "novel_psnr_masked": ("dB", f"test views under the recovered light: {m.DEFINITIONS['psnr_masked']}"),
+    "novel_ssim": ("", f"test views under the recovered light: {m.DEFINITIONS['ssim']}"),
+    "novel_ssim_masked": ("", f"test views under the recovered light: {m.DEFINITIONS['ssim_masked']}"),
+    "relit_psnr": ("dB", f"test views under the unseen lights, mean over lights, base colour scaled ({SCALE}): {m.DEFINITIONS['psnr']}"),
+    "relit_psnr_masked": ("dB", f"as relit_psnr: {m.DEFINITIONS['psnr_masked']}"),
+    "relit_ssim": ("", f"as relit_psnr: {m.DEFINITIONS['ssim']}"),
+    "relit_psnr_unscaled": ("dB", "as relit_psnr, without any scale"),
+    "relit_psnr_masked_unscaled": ("dB", "as relit_psnr_masked, without any scale"),
+    "albedo_psnr": (
+        "dB",
+        f"base colour in test views, scaled ({SCALE}), clipped to [0, 1] and sRGB-encoded, over pixels with truth coverage >= {m.MASK}; "
+        "a pixel without a prediction counts as black; mean of the per-view PSNR",
+    ),
+    "albedo_psnr_linear": ("dB", "as albedo_psnr, on linear values"),
+    "albedo_psnr_unscaled": ("dB", "as albedo_psnr, without any scale"),
+    "normal_mae": ("degrees", f"{m.DEFINITIONS['mae']}; mean over test views"),
+    "roughness_mse": ("", f"perceptual roughness (alpha = r^2) in test views: {m.DEFINITIONS['mse']}"),
+    "metallic_mse": ("", f"metallic in test views: {m.DEFINITIONS['mse']}"),
+    "mask_iou": ("", "intersection over union of predicted and true coverage >= .5, mean over test views"),
+    "chamfer": (
+        "world units",
+        f"mean of the two mean distances to the nearest sample, {SURFACE_SAMPLES} samples a mesh uniform by area, of which those count "
+        "that at least one camera (training or test) sees past the mesh itself: hidden inner surfaces do not count on either side",
+    ),
+    "chamfer_percent": ("% of diameter", "chamfer in per cent of the diameter of the true object's bounding sphere"),
+    "chamfer_accuracy": ("world units", "the half of chamfer from the reconstruction to the truth"),
+    "chamfer_completeness": ("world units", "the half of chamfer from the truth to the reconstruction"),
+    "environment_mse": (
+        "",
+        "recovered against true light, lat-long 256x512, clipped to [0, 1], to the power 1/2.2, mean of all texels (SfD)",
+    ),
+    "environment_mse_scaled": ("", "as environment_mse, the recovered light divided by the albedo scale first"),
+    "environment_log_rmse": (
+        "stops",
+        "root mean square difference of log2 radiance by solid angle at 32x64, below 1 % of the mean raised to it, light divided by the "
+        "albedo scale first",
+    ),
+    "glb_roundtrip_psnr": (
+        "dB",
+        f"object.glb read back against the asset's own textures, both under the recovered light, one seed, {ROUNDTRIP_VIEWS} test views: "
+        + m.DEFINITIONS["psnr"],
+    ),
+    "camera_rotation": ("degrees", "median rotation error of the recovered cameras after Sim(3) alignment to the true ones"),
+    "camera_centre_percent": ("% of diameter", "median distance of the recovered camera centres after Sim(3), of the object's diameter"),
+}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A synthetic capture's truth. train, test: cameras by name without folder and extension, in the true world frame.
+    radius: of the object's bounding sphere, world units. meta: the content of truth.json."""
+
+    folder: Path
+    train: dict[str, Camera]
+    test: dict[str, Camera]
+    radius: float
+    meta: dict[str, Any]
+
+    def picture(self, relative: str) -> np.ndarray:
+        """(H, W, C) or (H, W) float32 linear content of `truth/<relative>.exr`."""
+        from relit.images import read_data
+
+        return read_data(self.folder / "truth" / f"{relative}.exr")
+
+
+def load_truth(folder: str | Path) -> Truth:
+    """Read the cameras and the description of a synthetic capture. Raises UserError where there is none, or an unfinished one."""
+    folder = Path(folder)
+    folder = folder.parent if folder.name == "truth" else folder
+    file = folder / "truth" / "truth.json"
+    if not file.is_file():
+        why = (
+            "it is unfinished: its rendering was stopped"
+            if (folder / "truth" / "settings.json").exists()
+            else "there is no truth/truth.json"
+        )
+        raise UserError("the folder holds no complete truth", why, f"make one with `relit synthesize`, or give its folder: {folder}")
+    meta = json.loads(file.read_text())
+    size = meta["settings"]["resolution"]
+    train, test = (_read_cameras(folder / f"transforms_{split}.json", size) for split in ("train", "test"))
+    return Truth(folder, train, test, float(meta["sphere"]["radius"]), meta)
+
+
+def _read_cameras(file: Path, size: int) -> dict[str, Camera]:
+    content = json.loads(file.read_text())
+    focal = size / (2 * np.tan(content["camera_angle_x"] / 2))
+    return {
+        camera_key(f["file_path"]): Camera(
+            size, size, focal, focal, size / 2, size / 2, world_from_cv_camera(np.array(f["transform_matrix"], np.float64))
+        )
+        for f in content["frames"]
+    }
+
+
+def camera_key(name: str) -> str:
+    """What cameras are matched by: the file's name without folder and extension."""
+    return Path(name).stem
+
+
+def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 128, seed: int = 0) -> dict[str, Any]:
+    """Every figure that the truth allows, for the asset in a run or asset folder.
+
+    spp: samples a pixel of the pictures that are compared. Returns {"metrics": {name: {"value", "unit", "definition"}}, "per_view":
+    {view: {name: value}}, "albedo_scale": [r, g, b], "alignment": "identity" or "sim3"}. Call `relit.device.use_device` first.
+    """
+    from relit.asset.asset import load_asset
+    from relit.asset.gltf import read_asset_file
+
+    folder = Path(run_or_asset)
+    asset, truth = load_asset(folder), load_truth(truth_folder)
+    result = evaluate_asset(asset, truth, spp=spp, seed=seed)
+    glb = next((p for p in (folder / "object.glb", folder / "asset" / "object.glb") if p.is_file()), None)
+    if glb is not None and asset.environment is not None:
+        mesh, material = read_asset_file(glb)
+        value = glb_roundtrip(asset, mesh, material, truth, spp=spp, seed=seed)
+        result["metrics"].update(_entry("glb_roundtrip_psnr", value))
+    return result
+
+
+def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 128, seed: int = 0) -> dict[str, Any]:
+    """As `evaluate`, for an asset in memory; all but the GLB's round trip."""
+    from relit.rendering.mitsuba_scene import build_scene
+
+    recovered = {camera_key(name): camera for name, camera in asset.cameras}
+    asset, alignment = aligned(asset, truth, recovered)
+    world_from_asset = asset.world_from_asset
+    values: dict[str, float] = {}
+    per_view: dict[str, dict[str, float]] = {name: {} for name in truth.test}
+
+    scene = build_scene(asset.mesh, asset.material, world_from_asset, asset.environment)
+    scale = fixed_albedo_scale(scene, truth)
+    for name, camera in truth.test.items():
+        per_view[name].update(material_figures(scene, camera, truth, name, scale))
+    if asset.environment is not None:
+        for i, (name, camera) in enumerate(truth.test.items()):
+            per_view[name].update(_picture_figures("novel", scene, camera, truth.picture(f"test/{name}"), spp, seed + i))
+        light = truth.picture("environment")[..., :3]
+        values["environment_mse"] = m.environment_mse(asset.environment, light)
+        values["environment_mse_scaled"] = m.environment_mse(asset.environment / scale, light)
+        values["environment_log_rmse"] = m.environment_log_rmse(asset.environment / scale, light)
+
+    scaled = replace(asset.material, base_color=np.clip(asset.material.base_color * scale, 0, 1).astype(np.float32))
+    for light_name in truth.meta["relight"]:
+        light = truth.picture(f"relight/{light_name}")[..., :3]
+        for material, tail in ((scaled, ""), (asset.material, "_unscaled")):
+            scene = build_scene(asset.mesh, material, world_from_asset, light)
+            for i, (name, camera) in enumerate(truth.test.items()):
+                reference = truth.picture(f"relight/{light_name}/{name}")
+                figures = _picture_figures("relit", scene, camera, reference, spp, seed + i)
+                per_view[name].update({f"{key}{tail}:{light_name}": value for key, value in figures.items()})
+
+    values.update(chamfer_figures(asset.mesh, world_from_asset, truth))
+    if alignment == "sim3":
+        rotations, distances = pose_errors({k: c for k, c in _cameras_of(asset)}, truth.train, np.eye(4))
+        values["camera_rotation"] = float(np.median(rotations))
+        values["camera_centre_percent"] = float(100 * np.median(distances) / (2 * truth.radius))
+    values = {**_means(per_view), **values}
+    return {
+        "metrics": {k: v for name in DEFINITIONS if name in values for k, v in _entry(name, values[name]).items()},
+        "per_view": per_view,
+        "albedo_scale": [float(x) for x in scale],
+        "alignment": alignment,
+    }
+
+
+# ---------------------------------------------------------------- frames
+
+
+def aligned(asset: Asset, truth: Truth, recovered: dict[str, Camera]) -> tuple[Asset, str]:
+    """The asset carried into the truth's frame, and how: 'identity' when its cameras stand there already (they were given) or it has
+    none, 'sim3' when they were recovered from photos and the frame is free."""
+    from relit.conventions import move_pose
+
+    if not recovered or same_frame(recovered, truth.train):
+        return asset, "identity"
+    s = align_cameras(recovered, truth.train)
+    environment = None if asset.environment is None else rotate_environment(asset.environment, s)
+    cameras = tuple((name, camera.with_pose(move_pose(s, camera.world_from_camera))) for name, camera in asset.cameras)
+    return replace(asset, world_from_asset=s @ asset.world_from_asset, environment=environment, cameras=cameras), "sim3"
+
+
+def _cameras_of(asset: Asset):
+    return [(camera_key(name), camera) for name, camera in asset.cameras]
+
+
+# ---------------------------------------------------------------- figures
+
+
+def fixed_albedo_scale(scene, truth: Truth) -> np.ndarray:
+    """(3,) the albedo scale of the whole evaluation: over the pixels of the kept training views that both the truth (coverage >= MASK)
+    and the prediction cover."""
+    from relit.rendering.mitsuba_scene import render_channels
+
+    predicted, true = [], []
+    for name in truth.meta["train_albedo"]:
+        channels = render_channels(scene, truth.train[name], spp=16)
+        reference = truth.picture(f"train_albedo/{name}")
+        inside = (reference[..., 3] >= m.MASK) & (channels["alpha"] > 0)
+        predicted.append(channels["albedo"][inside])
+        true.append(reference[..., :3][inside])
+    return m.albedo_scale(np.concatenate(predicted), np.concatenate(true))
+
+
+def material_figures(scene, camera: Camera, truth: Truth, name: str, scale: np.ndarray) -> dict[str, float]:
+    """Albedo, normal, roughness, metallic and mask figures of one test view."""
+    from relit.rendering.mitsuba_scene import render_channels
+
+    p = render_channels(scene, camera, spp=32)
+    albedo, normal = truth.picture(f"test/{name}_albedo"), truth.picture(f"test/{name}_normal")
+    inside = albedo[..., 3] >= m.MASK
+    t, q = albedo[..., :3], p["albedo"]
+    return {
+        "albedo_psnr": m.psnr(m.encode(q * scale), m.encode(t), inside),
+        "albedo_psnr_linear": m.psnr(np.clip(q * scale, 0, 1), np.clip(t, 0, 1), inside),
+        "albedo_psnr_unscaled": m.psnr(m.encode(q), m.encode(t), inside),
+        "normal_mae": float(m.normal_angles(p["normal"], normal[..., :3])[inside].mean()),
+        "roughness_mse": float(np.square(p["roughness"] - truth.picture(f"test/{name}_roughness"))[inside].mean()),
+        "metallic_mse": float(np.square(p["metallic"] - truth.picture(f"test/{name}_metallic"))[inside].mean()),
+        "mask_iou": m.mask_iou(p["alpha"], albedo[..., 3]),
+    }
+
+
+def _picture_figures(prefix: str, scene, camera: Camera, reference: np.ndarray, spp: int, seed: int) -> dict[str, float]:
+    from relit.rendering.mitsuba_scene import render
+
+    a, b = m.encode(render(scene, camera, spp=spp, seed=seed)[..., :3]), m.encode(reference[..., :3])
+    inside, s = reference[..., 3] >= m.MASK, m.ssim_map(a, b)
+    return {
+        f"{prefix}_psnr": m.psnr(a, b),
+        f"{prefix}_psnr_masked": m.psnr(a, b, inside),
+        f"{prefix}_ssim": float(s.mean()),
+        f"{prefix}_ssim_masked": float(s[inside].mean()) if inside.any() else float("nan"),
+    }
+
+
+def glb_roundtrip(asset: Asset, mesh: Mesh, material: Material, truth: Truth, *, spp: int, seed: int) -> float:
+    """Mean PSNR of the GLB as read back against the asset's own textures: the same views, light and random numbers."""
+    from relit.rendering.mitsuba_scene import build_scene, render
+
+    asset, _ = aligned(asset, truth, dict(_cameras_of(asset)))
+    own = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
+    read = build_scene(mesh, material, asset.world_from_asset, asset.environment)
+    names = list(truth.test)
+    values = []
+    for i in np.unique(np.linspace(0, len(names) - 1, min(ROUNDTRIP_VIEWS, len(names))).round().astype(int)):
+        a, b = (m.encode(render(s, truth.test[names[i]], spp=spp, seed=seed)[..., :3]) for s in (own, read))
+        values.append(m.psnr(a, b))
+    return float(np.mean(values))
+
+
+def visible(mesh: Mesh, world_from_asset, points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+    """(N,) bool: whether the segment from a world point (N, 3) on the mesh to some camera's centre is free of the mesh.
+
+    Segments start 1e-4 of the mesh's extent off the point, towards the camera.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    from relit.rendering.mitsuba_scene import build_scene
+
+    grey = Material(np.full((1, 1, 3), 0.5, np.float32), np.ones((1, 1), np.float32), np.zeros((1, 1), np.float32))
+    scene = build_scene(Mesh(mesh.vertices, mesh.faces, mesh.normals), grey, world_from_asset, None).mi_scene
+    gap = 1e-4 * float(np.ptp(points, axis=0).max())
+    p, seen = mi.Point3f(*[mi.Float(np.ascontiguousarray(points[:, k], np.float32)) for k in range(3)]), mi.Bool(False)
+    for camera in cameras:
+        centre = mi.Point3f(*[dr.opaque(mi.Float, float(x)) for x in camera.centre])
+        d = centre - p
+        length = dr.norm(d)
+        d /= length
+        seen = seen | ~scene.ray_test(mi.Ray3f(p + gap * d, d, length - gap, 0.0, []))
+        dr.eval(seen)
+    return seen.numpy().astype(bool) & np.ones(len(points), bool)
+
+
+def chamfer_figures(mesh: Mesh, world_from_asset, truth: Truth, count: int = SURFACE_SAMPLES) -> dict[str, float]:
+    """The Chamfer figures between the surfaces that cameras can see (`DEFINITIONS['chamfer']`)."""
+    import trimesh
+
+    cameras = [*truth.train.values(), *truth.test.values()]
+    loaded = trimesh.load(truth.folder / "truth" / "mesh.ply", process=False)
+    true_mesh = Mesh(np.asarray(loaded.vertices, np.float32), np.asarray(loaded.faces, np.int32))
+    samples = []
+    for i, (each, frame) in enumerate(((mesh, world_from_asset), (true_mesh, np.eye(4)))):
+        points, _ = m.sample_surface(move_points(frame, each.vertices), each.faces, count, seed=i)
+        seen = visible(each, frame, points, cameras)
+        if not seen.any():
+            raise UserError("no part of the mesh can be seen by any camera", "it lies elsewhere than the cameras look, or is empty")
+        samples.append(points[seen])
+    mean, accuracy, completeness = m.chamfer(*samples)
+    return {
+        "chamfer": mean,
+        "chamfer_percent": 100 * mean / (2 * truth.radius),
+        "chamfer_accuracy": accuracy,
+        "chamfer_completeness": completeness,
+    }
+
+
+# ---------------------------------------------------------------- results
+
+
+def _entry(name: str, value: float) -> dict[str, dict[str, Any]]:
+    unit, definition = DEFINITIONS[name]
+    return {name: {"value": float(value), "unit": unit, "definition": definition}}
+
+
+def _means(per_view: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Mean of each per-view figure over views, and over lights where there are several ('name:light')."""
+    gathered: dict[str, list[float]] = {}
+    for figures in per_view.values():
+        for key, value in figures.items():
+            gathered.setdefault(key.split(":")[0], []).append(value)
+    return {key: float(np.mean(values)) for key, values in gathered.items()}
+
+
+def table(result: dict[str, Any], title: str = "", definitions: bool = True):
+    """A rich Table of the figures, with what each means."""
+    from rich.table import Table
+
+    out = Table(title=title or None)
+    out.add_column("figure")
+    out.add_column("value", justify="right")
+    out.add_column("unit")
+    if definitions:
+        out.add_column("definition", overflow="fold")
+    for name, entry in result["metrics"].items():
+        row = [name, f"{entry['value']:.4g}", entry["unit"]]
+        out.add_row(*row, *([entry["definition"]] if definitions else []))
+    return out
