@@ -57,7 +57,8 @@ def _register(variant: str) -> None:
             self.specular = props.get_texture("specular", 1.0)
             self.normalmap = props.get_texture("normalmap") if props.has_property("normalmap") else None
             self.f0 = f0_from_ior(float(props.get("int_ior", 1.5)))
-            self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
+            flags = mi.BSDFFlags
+            self.m_components = [flags.DiffuseReflection | flags.GlossyReflection | flags.FrontSide | flags.BackSide]
             self.m_flags = self.m_components[0]
 
         def surface(self, si, active=True):

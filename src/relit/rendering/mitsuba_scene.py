@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from relit.conventions import scale_of
+from relit.conventions import move_points, move_pose, scale_of, similarity
 from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals, vertex_tangents
 from relit.rendering import bsdf as relit_bsdf
@@ -24,12 +24,17 @@ RAYS_PER_PASS = 1 << 21  # bounds the memory of a pass: about 50 bytes a ray
 
 @dataclass(frozen=True)
 class Scene:
-    """What `build_scene` returns. mi_scene: the Mitsuba scene in the world frame. textures: Mitsuba textures by name
-    (base_color, roughness, metallic, specular, normalmap; the last two may be None). integrators: Mitsuba integrators by maximal depth, made on demand."""
+    """What `build_scene` returns.
+
+    mi_scene: the Mitsuba scene, moved and scaled (not turned) so that the object fills the unit ball: Mitsuba's ray offsets have a
+    fixed size. textures: Mitsuba textures by name (base_color, roughness, metallic, specular, normalmap; the last two may be None).
+    integrators: Mitsuba integrators by maximal depth, made on demand. unit_from_world: (4, 4), scale and translation.
+    """
 
     mi_scene: Any
     textures: dict
     integrators: dict
+    unit_from_world: np.ndarray
 
 
 def _texture(array, *, color=False):
@@ -38,7 +43,10 @@ def _texture(array, *, color=False):
     a = a[..., None] if a.ndim == 2 else a
     if color and a.shape[2] == 1:
         a = np.repeat(a, 3, 2)
-    return mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(a)), "raw": True, "format": "variant", "filter_type": "bilinear", "wrap_mode": "repeat"})
+    bitmap = mi.Bitmap(np.ascontiguousarray(a))
+    return mi.load_dict(
+        {"type": "bitmap", "bitmap": bitmap, "raw": True, "format": "variant", "filter_type": "bilinear", "wrap_mode": "repeat"}
+    )
 
 
 def environment_bitmap(environment):
@@ -55,8 +63,15 @@ def environment_bitmap(environment):
     return out
 
 
-def _mesh(mesh: Mesh, world_from_asset, bsdf, with_tangents: bool):
-    m = np.asarray(world_from_asset, np.float64)
+def _unit_from_world(mesh: Mesh, world_from_asset) -> np.ndarray:
+    points = move_points(world_from_asset, mesh.vertices)
+    low, high = points.min(0), points.max(0)
+    centre, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-12)
+    return similarity(np.eye(3), -centre / radius, 1 / radius)
+
+
+def _mesh(mesh: Mesh, unit_from_asset, bsdf, with_tangents: bool):
+    m = np.asarray(unit_from_asset, np.float64)
     rotation = m[:3, :3] / scale_of(m)
     normals = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64) @ rotation.T
     props = mi.Properties()
@@ -85,7 +100,8 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
     if bsdf not in ("relit", "principled"):
         raise UserError(f"unknown bsdf '{bsdf}'", fix="choose relit or principled", code=2)
     if material.normal is not None and mesh.uvs is None:
-        raise UserError("the material has a normal map but the mesh has no texture coordinates", fix="give the mesh uvs, or drop the normal map")
+        raise UserError("the material has a normal map but the mesh has no texture coordinates", fix="give it uvs, or drop the map")
+    world_from_asset = np.eye(4) if world_from_asset is None else np.asarray(world_from_asset, np.float64)
     t = {
         "base_color": _texture(material.base_color, color=True),
         "roughness": _texture(material.roughness),
@@ -102,24 +118,26 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
         if t["normalmap"] is not None:
             d = {"type": "normalmap", "normalmap": t["normalmap"], "bsdf": d}
         d = {"type": "twosided", "bsdf": d}
-    scene = {"type": "scene", "object": _mesh(mesh, np.eye(4) if world_from_asset is None else world_from_asset, mi.load_dict(d), t["normalmap"] is not None)}
+    unit_from_world = _unit_from_world(mesh, world_from_asset)
+    shape = _mesh(mesh, unit_from_world @ world_from_asset, mi.load_dict(d), t["normalmap"] is not None)
+    scene = {"type": "scene", "object": shape}
     if environment is not None:
         scene["environment"] = {"type": "envmap", "bitmap": mi.Bitmap(environment_bitmap(environment))}
-    return Scene(mi.load_dict(scene), t, {})
+    return Scene(mi.load_dict(scene), t, {}, unit_from_world)
 
 
-def _camera_rays(camera: Camera, sampler, count: int):
-    """`count` rays (sample-major: pixel = index mod W * H) through uniformly jittered positions (a box filter), in the world frame;
+def _camera_rays(scene: Scene, camera: Camera, sampler, count: int):
+    """`count` rays (sample-major: pixel = index mod W * H) through uniformly jittered positions (a box filter), in the unit frame;
     also the cosine to the optical axis, which turns distance into depth."""
     if camera.distortion and np.any(np.asarray(camera.distortion)):
-        raise UserError("a camera with lens distortion cannot be rendered", "reference pictures are pinhole pictures", "undistort the camera first")
+        raise UserError("a camera with lens distortion cannot be rendered", "pictures are pinhole pictures", "undistort the camera first")
     pixels = camera.width * camera.height
     index = dr.arange(mi.UInt32, count) % pixels
     jitter = sampler.next_2d()
     o = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731  values that change per view must not become literals
     x = (mi.Float(index % camera.width) + jitter.x - o(camera.cx)) / o(camera.fx)
     y = (mi.Float(index // camera.width) + jitter.y - o(camera.cy)) / o(camera.fy)
-    m = [[o(v) for v in row] for row in np.asarray(camera.world_from_camera, np.float64)[:3]]
+    m = [[o(v) for v in row] for row in move_pose(scene.unit_from_world, camera.world_from_camera)[:3]]
     inv = dr.rsqrt(dr.fma(x, x, dr.fma(y, y, 1)))
     d = mi.Vector3f(*[(r[0] * x + r[1] * y + r[2]) * inv for r in m])
     return mi.RayDifferential3f(mi.Point3f(m[0][3], m[1][3], m[2][3]), dr.normalize(d)), inv
@@ -149,7 +167,7 @@ def render(scene: Scene, camera: Camera, *, spp: int, seed: int = 0, max_depth: 
     total = np.zeros((pixels, 4))
     with dr.suspend_grad():
         for sampler, n in _passes(camera, spp, seed):
-            ray, _ = _camera_rays(camera, sampler, n * pixels)
+            ray, _ = _camera_rays(scene, camera, sampler, n * pixels)
             color, hit, _ = integrator.sample(scene.mi_scene, sampler, ray)
             rgba = [*color, dr.select(hit, mi.Float(1), 0)]
             dr.eval(rgba)
@@ -170,7 +188,7 @@ def render_channels(scene: Scene, camera: Camera, spp: int = 16, seed: int = 0) 
     t = scene.textures
     with dr.suspend_grad():
         for sampler, n in _passes(camera, spp, seed):
-            ray, cos = _camera_rays(camera, sampler, n * pixels)
+            ray, cos = _camera_rays(scene, camera, sampler, n * pixels)
             si = scene.mi_scene.ray_intersect(ray)
             hit = si.is_valid()
             normal = si.to_world(mi.Vector3f(relit_bsdf.shading_normal(si, t["normalmap"], hit)))
@@ -190,6 +208,6 @@ def render_channels(scene: Scene, camera: Camera, spp: int = 16, seed: int = 0) 
         "roughness": mean[..., 3],
         "metallic": mean[..., 4],
         "normal": normal / np.maximum(length, 1e-9),
-        "depth": mean[..., 8],
+        "depth": mean[..., 8] / np.float32(scale_of(scene.unit_from_world)),
         "alpha": alpha,
     }
