@@ -9,6 +9,7 @@ from pathlib import Path
 from relit.errors import EXIT_ENVIRONMENT, UserError
 
 MIN_LLVM = 17  # older ones abort the process on x86-64 with AVX-512: "Cannot select: fmaximum"
+LLVM_PATTERNS = ["/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*", "/usr/local/lib/libLLVM*.so*"]
 VARIANTS = {"cpu": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 LLVM_FIX = "sudo apt-get install -y libllvm19   (Debian, Ubuntu; libLLVM 17 or newer), or set DRJIT_LIBLLVM_PATH to the file"
 
@@ -18,8 +19,7 @@ def find_libllvm() -> str | None:
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given if Path(given).exists() else None
-    patterns = ["/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*", "/usr/local/lib/libLLVM*.so*"]
-    found = sorted({p for pattern in patterns for p in glob.glob(pattern)}, key=_llvm_version)
+    found = sorted({p for pattern in LLVM_PATTERNS for p in glob.glob(pattern)}, key=_llvm_version)
     return found[-1] if found and _llvm_version(found[-1]) >= (MIN_LLVM,) else None
 
 
@@ -51,7 +51,8 @@ def use_device(device: str = "auto") -> str:
         )
     chosen = "cuda" if device == "cuda" or (device == "auto" and has_cuda) else "cpu"
     if chosen == "cpu" and not (llvm and dr.has_backend(dr.JitBackend.LLVM)):
-        raise UserError("no usable libLLVM was found", f"Relit compiles its kernels with it on the CPU; it is not in any wheel; version {MIN_LLVM} or newer is needed", LLVM_FIX, code=EXIT_ENVIRONMENT)
+        why = f"Relit compiles its kernels with it on the CPU; it is not in any wheel; version {MIN_LLVM} or newer is needed"
+        raise UserError("no usable libLLVM was found", why, LLVM_FIX, code=EXIT_ENVIRONMENT)
     mi.set_variant(VARIANTS[chosen])
     mi.set_log_level(mi.LogLevel.Error)
     return chosen

@@ -1,0 +1,93 @@
+"""`relit doctor` finds what is there, and says what is missing with the command that mends it."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+from relit import device, doctor
+from relit.errors import EXIT_ENVIRONMENT, EXIT_OK, UserError
+
+
+def named(checks):
+    return {c.name: c for c in checks}
+
+
+def test_this_machine_is_examined(tmp_path, monkeypatch):
+    ran = []
+    real = doctor._gradient
+    monkeypatch.setattr(doctor, "_gradient", lambda device: ran.append(device) or real(device))
+    checks = doctor.examine(tmp_path)
+    by_name = named(checks)
+    assert by_name["libLLVM"].ok and by_name["gradient on cpu"].ok and "cpu" in ran
+    assert doctor.verdict(checks) == EXIT_OK
+    said = json.loads(doctor.as_json(checks))
+    assert said["ok"] and {"Python", "wheels", "libLLVM", "CUDA", "memory", "disk", "ffmpeg"} <= {c["name"] for c in said["checks"]}
+    text = doctor.as_text(checks)
+    assert "Relit can run on this machine." in text and str(tmp_path) in text
+
+
+def test_a_missing_libllvm_is_named_with_its_command(monkeypatch, tmp_path):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "nowhere.so"))
+    checks = doctor.examine(tmp_path)
+    assert named(checks)["libLLVM"].ok is False and "nowhere.so" in named(checks)["libLLVM"].found
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH")
+    (tmp_path / "libLLVM-15.so.1").touch()
+    for module in (device, doctor):
+        monkeypatch.setattr(module, "LLVM_PATTERNS", [str(tmp_path / "libLLVM*.so*")])
+    checks = doctor.examine(tmp_path)
+    assert "only older ones than 17" in named(checks)["libLLVM"].found
+    if named(checks)["CUDA"].ok is None:
+        assert doctor.verdict(checks) == EXIT_ENVIRONMENT
+        assert "libllvm19" in doctor.as_text(checks) and "cannot run" in doctor.as_text(checks)
+
+
+def test_use_device_says_what_is_missing(monkeypatch, tmp_path):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "nowhere.so"))
+    monkeypatch.setattr(device, "find_libllvm", lambda: None)
+    with pytest.raises(UserError, match="libLLVM") as caught:
+        device.use_device("cpu")
+    assert caught.value.code == EXIT_ENVIRONMENT and "apt-get install" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    "program, said",
+    [
+        ("import os; os.abort()", "killed by signal 6"),
+        ("print('gradient', 1.0, 2.0)", "50.00 % off"),
+        ("raise SystemExit(3)", "exit code 3"),
+    ],
+)
+def test_a_dying_or_wrong_compiler_is_reported_not_suffered(monkeypatch, program, said):
+    monkeypatch.setattr(doctor, "PROBE", program)
+    check = doctor._gradient("cpu")
+    assert check.ok is False and said in check.found and check.fix
+
+
+def test_missing_wheels_and_extras(monkeypatch, tmp_path):
+    monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda _: ["numpy", "no-such-wheel>=2", 'other; extra == "dev"'])
+    check = doctor._wheels()
+    assert check.ok is False and check.found == "not installed: no-such-wheel" and check.fix == "make setup"
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
+    extras = doctor._extras()
+    assert all(c.ok is None and c.fix for c in extras)
+    assert any(c.fix == f"{sys.executable} -m pip install pillow-heif" for c in extras)
+
+
+def test_little_disk_and_memory(monkeypatch, tmp_path):
+    class Usage:
+        free = 5e8
+
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: Usage)
+    monkeypatch.setattr(doctor, "available_memory", lambda: 1e9)
+    assert doctor._disk(tmp_path).ok is False and "500 MB" in doctor._disk(tmp_path).found
+    assert doctor._memory().ok is None and "draft" in doctor._memory().fix
+
+
+def test_kernel_cache_that_cannot_be_written(monkeypatch, tmp_path):
+    (tmp_path / ".drjit").write_text("a file is in the way")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert doctor._cache().ok is None
