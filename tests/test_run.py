@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from relit.errors import EXIT_ENVIRONMENT, UserError
-from relit.files import digests, disk_error, load_arrays, save_arrays, toml_text, write_text
+from relit.files import digests, disk_error, load_arrays, parse_toml, save_arrays, toml_text, write_text
 from relit.log import Log, MemoryWatch, Progress, peak_memory, readable_bytes, readable_seconds
-from relit.run import Run, read_metrics, tomllib
+from relit.run import Run, read_metrics
 
 CONFIG = {"capture": "multiview", "seed": 0, "settings": {"steps": 3, "rate": 0.5, "fast": True, "name": 'a "b"\n\\c'}}
 
@@ -93,7 +93,7 @@ def test_a_second_run_in_the_same_process_is_refused_until_the_first_is_closed(t
 
 def test_config_is_saved_as_toml_and_read_back(tmp_path):
     with Run.open(tmp_path / "run", CONFIG):
-        assert tomllib.loads((tmp_path / "run/config.toml").read_text()) == CONFIG
+        assert parse_toml((tmp_path / "run/config.toml").read_text()) == CONFIG
 
 
 def test_other_settings_are_refused_by_name(tmp_path):
@@ -103,7 +103,7 @@ def test_other_settings_are_refused_by_name(tmp_path):
     text = str(caught.value)
     assert "seed was 0, is now 1" in text and "settings.steps was 3, is now 4" in text and "--overwrite" in text
     assert "rate" not in text
-    assert tomllib.loads((tmp_path / "config.toml").read_text()) == CONFIG
+    assert parse_toml((tmp_path / "config.toml").read_text()) == CONFIG
 
 
 def test_resume_false_removes_only_what_a_run_made(tmp_path):

@@ -17,6 +17,11 @@ import numpy as np
 from relit.errors import EXIT_ENVIRONMENT, UserError
 from relit.log import readable_bytes
 
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib
+
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file such that it is either the old or the new one, whenever the process dies."""
@@ -79,6 +84,11 @@ def toml_text(config: dict) -> str:
         if isinstance(table, dict):
             plain += ["", f"[{key}]"] + [f"{k} = {_toml_value(v)}" for k, v in table.items() if v is not None]
     return "\n".join(plain) + "\n"
+
+
+def parse_toml(text: str) -> dict:
+    """TOML -> a dictionary. Raises ValueError."""
+    return tomllib.loads(text)
 
 
 def _toml_value(value) -> str:

@@ -23,13 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from relit.errors import EXIT_USAGE, UserError
-from relit.files import disk_errors, load_arrays, read_json, save_arrays, toml_text, write_text
+from relit.files import disk_errors, load_arrays, parse_toml, read_json, save_arrays, toml_text, write_text
 from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_seconds
-
-try:
-    import tomllib
-except ModuleNotFoundError:  # Python 3.10
-    import tomli as tomllib
 
 CHECKPOINT_SECONDS = 20.0  # a checkpoint is due this long after the last one, later if writing one is slow
 CHECKPOINT_LONGEST = 60.0  # ... but never later than this
@@ -58,7 +53,7 @@ class Run:
         Raises UserError when the folder holds something else, another process has it, or its settings or inputs differ.
         """
         folder = Path(folder)
-        wanted = tomllib.loads(toml_text(config))
+        wanted = parse_toml(toml_text(config))
         with disk_errors(folder):
             _refuse_foreign(folder)
             folder.mkdir(parents=True, exist_ok=True)
@@ -109,9 +104,10 @@ class Run:
                 yield stage
         except BaseException as error:
             watch.stop()
-            self.log.clear()
             with contextlib.suppress(OSError):
                 self.log.note(f"{stage.title}: stopped by {type(error).__name__} after {readable_seconds(stage.seconds)}")
+                if isinstance(error, (KeyboardInterrupt, Terminated)):
+                    self.say(f"stopped in '{stage.title}'; {stage.where_it_resumes()}")
             raise
         peak = watch.stop()
         record = {"name": name, "title": stage.title, "seconds": round(stage.seconds, 3), "peak_memory": peak, "ended": time.time()}
@@ -171,6 +167,12 @@ class Stage:
             write_text(self.folder / "time.json", json.dumps({"seconds": round(self.seconds, 3)}))
         self._saved = time.monotonic()
         self._interval = min(max(CHECKPOINT_SECONDS, 10 * (self._saved - begun)), CHECKPOINT_LONGEST)
+
+    def where_it_resumes(self) -> str:
+        """What the same command will do after a stop now."""
+        if not any(self.folder.glob("*.npz")):
+            return "the same command begins this stage anew"
+        return f"the same command goes on from the checkpoint of {readable_seconds(time.monotonic() - self._saved)} ago"
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
         """The arrays of <name>.npz, or None if there is none or it cannot be read (then a line says so)."""
@@ -267,8 +269,8 @@ def _compare(folder: Path, wanted: dict, inputs: dict[str, str] | None) -> None:
     if not path.exists():
         return
     try:
-        saved = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        saved = parse_toml(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise UserError(f"the run's config.toml cannot be read: {error}", fix=f"use another -o, or --overwrite: {path}") from None
     a, b = _flat(saved), _flat(wanted)
     keys = [k for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)]

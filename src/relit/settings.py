@@ -1,0 +1,111 @@
+"""Settings of a recipe: a flat frozen dataclass, changed by `--set key=value` or a TOML file, each value checked against its type."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterable
+from pathlib import Path
+
+from relit.errors import EXIT_USAGE, UserError, did_you_mean
+from relit.files import parse_toml
+
+
+def with_pairs(options, pairs: Iterable[str], prefix: str = "--set"):
+    """`options` with 'key=value' texts applied. Raises UserError (code 2) for an unknown key or a value of another type."""
+    changes = {}
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        if not equals:
+            raise UserError(f"{prefix} {pair}: no '=' in it", fix=f"{prefix} key=value", code=EXIT_USAGE)
+        changes[key.strip()] = text.strip()
+    return with_values(options, changes, prefix)
+
+
+def with_values(options, values: dict, source: str):
+    """`options` with {key: value} applied; values are texts (from the command line) or TOML values. `source` is named in errors."""
+    hints = typing.get_type_hints(type(options))
+    changes = {}
+    for key, value in values.items():
+        if key not in hints:
+            what = f"{source}: unknown key '{key}'.{did_you_mean(key, hints)}"
+            raise UserError(what, f"known keys: {', '.join(hints)}", code=EXIT_USAGE)
+        try:
+            changes[key] = convert(value, hints[key])
+        except ValueError:
+            what = f"{source}: {key}={value} is no {describe(hints[key])}"
+            raise UserError(what, f"{key} is {getattr(options, key)!r} by default", code=EXIT_USAGE) from None
+    try:
+        return dataclasses.replace(options, **changes)
+    except ValueError as error:  # a recipe's own check
+        raise UserError(f"{source}: {error}", code=EXIT_USAGE) from None
+
+
+def convert(value, hint):
+    """A text or a TOML value -> a value of type `hint`: bool, int, float, str, Literal, tuple/list of those, or one of them or None."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None or (isinstance(value, str) and value.lower() in ("none", "") and type(None) in args):
+            return None
+        for arm in (a for a in args if a is not type(None)):
+            try:
+                return convert(value, arm)
+            except ValueError:
+                continue
+        raise ValueError
+    if origin is typing.Literal:
+        return next((a for a in args if str(a) == str(value)), None) or _fail()
+    if origin in (tuple, list):
+        parts = [p for p in value.replace("[", "").replace("]", "").split(",") if p.strip()] if isinstance(value, str) else list(value)
+        kinds = [args[0]] * len(parts) if len(args) != len(parts) or args[-1] is Ellipsis or origin is list else list(args)
+        if origin is tuple and Ellipsis not in args and len(args) != len(parts):
+            raise ValueError
+        return origin(convert(p.strip() if isinstance(p, str) else p, k) for p, k in zip(parts, kinds, strict=True))
+    if hint is bool:
+        return _bool(value)
+    if isinstance(value, bool):
+        raise ValueError
+    if hint is int:
+        number = float(value)
+        return int(number) if number.is_integer() else _fail()
+    if hint is float:
+        return float(value)
+    if hint is str and isinstance(value, str):
+        return value
+    raise ValueError
+
+
+def _bool(value) -> bool:
+    if isinstance(value, bool):
+        return value
+    words = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+    return words[str(value).lower()] if str(value).lower() in words else _fail()
+
+
+def _fail():
+    raise ValueError
+
+
+def describe(hint) -> str:
+    """'whole number', 'true or false', 'draft, standard or high'."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join("none" if a is type(None) else describe(a) for a in args)
+    if origin is typing.Literal:
+        return "one of " + ", ".join(str(a) for a in args)
+    if origin in (tuple, list):
+        return f"list of {describe(args[0])}"
+    return {bool: "true or false", int: "whole number", float: "number", str: "text"}.get(hint, str(hint))
+
+
+def read_config(path: str | Path) -> dict:
+    """A TOML file as a dictionary. Raises UserError (code 2) when it is not there or no TOML."""
+    path = Path(path)
+    try:
+        return parse_toml(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError("the configuration file is not there", fix=f"check the path: {path}", code=EXIT_USAGE) from None
+    except (OSError, ValueError) as error:
+        what = f"the configuration file cannot be read: {error}"
+        raise UserError(what, fix=f"it must be TOML, key = value: {path}", code=EXIT_USAGE) from None
