@@ -71,24 +71,22 @@ def synthesize_multiview(
     """
     asset_file, light_file, out = Path(asset_file), Path(light_file), Path(out)
     relights = [Path(r) for r in relights]
-    _check(asset_file, [light_file, *relights], views, test_views, resolution, spp, test_spp, truth_bsdf)
-    settings = {
-        "version": VERSION,
-        "kind": "multiview",
-        "asset": _identity(asset_file),
-        "light": _identity(light_file),
-        "relights": [_identity(r) for r in relights],
-        "views": views,
-        "test_views": test_views,
-        "resolution": resolution,
-        "spp": spp,
-        "test_spp": test_spp,
-        "seed": seed,
-        "truth_bsdf": truth_bsdf,
-        "roughness": roughness,
-        "metallic": metallic,
-        "max_depth": max_depth,
-    }
+    _check(relights, views, test_views, resolution, spp, test_spp, truth_bsdf, roughness, metallic)
+    settings = settings_of(
+        asset_file,
+        light_file,
+        views=views,
+        test_views=test_views,
+        relights=relights,
+        resolution=resolution,
+        spp=spp,
+        test_spp=test_spp,
+        seed=seed,
+        truth_bsdf=truth_bsdf,
+        roughness=roughness,
+        metallic=metallic,
+        max_depth=max_depth,
+    )
     if _claim(out, settings):
         return out
 
@@ -255,15 +253,15 @@ def _test_view(out: Path, scene, name: str, camera: Camera, spp: int, max_depth:
 # ---------------------------------------------------------------- files
 
 
-def _check(asset_file, lights, views, test_views, resolution, spp, test_spp, truth_bsdf) -> None:
-    for file, what in [(asset_file, "asset")] + [(f, "light") for f in lights]:
-        if not file.is_file():
-            raise UserError(f"no {what} file: {file}", fix=f"give an existing {'GLB or OBJ' if what == 'asset' else 'HDR or EXR'} file")
-    if len({f.stem for f in lights[1:]}) < len(lights) - 1:
+def _check(relights, views, test_views, resolution, spp, test_spp, truth_bsdf, roughness, metallic) -> None:
+    if len({f.stem for f in relights}) < len(relights):
         raise UserError("two relighting files have one name", "the truth is kept by name", "rename one of them")
     for label, value, least in [("views", views, 2), ("test_views", test_views, 1), ("resolution", resolution, 8)]:
         if value < least:
             raise UserError(f"{label} = {value} is too few", fix=f"at least {least}", code=2)
+    for label, value in [("roughness", roughness), ("metallic", metallic)]:
+        if value is not None and not 0 <= value <= 1:
+            raise UserError(f"{label} = {value} is outside [0, 1]", code=2)
     if spp < 1 or test_spp < 1:
         raise UserError("samples per pixel must be at least 1", code=2)
     if truth_bsdf not in ("relit", "principled"):
@@ -276,6 +274,19 @@ def _identity(file: Path) -> dict[str, str]:
         for sibling in sorted(p for p in file.parent.iterdir() if p.is_file() and p != file):
             digest.update(sibling.name.encode() + sibling.read_bytes())
     return {"name": file.name, "sha256": digest.hexdigest()[:16]}
+
+
+def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) -> dict[str, Any]:
+    """Everything that a capture depends on: the options of `synthesize_multiview`, its defaults, and digests of the files."""
+    files = {"asset": Path(asset_file), "light": Path(light_file)}
+    relights = [Path(r) for r in options.pop("relights", ())]
+    for what, file in [*files.items(), *(("light", r) for r in relights)]:
+        if not file.is_file():
+            raise UserError(f"no {what} file: {file}", fix=f"give an existing {'GLB or OBJ' if what == 'asset' else 'HDR or EXR'} file")
+    defaults = synthesize_multiview.__kwdefaults__
+    plain = {key: options.get(key, value) for key, value in defaults.items() if key not in ("relights", "say")}
+    digests = {what: _identity(file) for what, file in files.items()}
+    return {"version": VERSION, "kind": "multiview", **digests, "relights": [_identity(r) for r in relights], **plain}
 
 
 def settings_hash(settings: dict[str, Any]) -> str:
@@ -301,11 +312,8 @@ def _claim(out: Path, settings: dict[str, Any]) -> bool:
 
 def _override(material: Material, roughness: float | None, metallic: float | None) -> Material:
     for key, value in (("roughness", roughness), ("metallic", metallic)):
-        if value is None:
-            continue
-        if not 0 <= value <= 1:
-            raise UserError(f"{key} = {value} is outside [0, 1]", code=2)
-        material = replace(material, **{key: np.full_like(getattr(material, key), value)})
+        if value is not None:
+            material = replace(material, **{key: np.full_like(getattr(material, key), value)})
     return material
 
 
