@@ -1,0 +1,117 @@
+"""The plan of a job before anything is computed: flags and configuration, how the input is opened, what it will cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError, did_you_mean
+from relit.files import digests
+from relit.log import available_memory, readable_bytes
+from relit.scene import Capture, Sphere
+from relit.settings import read_config, with_values
+
+CAPTURES = ("multiview",)  # the kinds that this version reconstructs
+LATER = ("flash", "duplicates", "collection")
+QUALITIES = ("draft", "standard", "high")
+JOB_KEYS = {"capture": str, "quality": str, "seed": int, "masks": str, "max_side": int, "focal": float, "sphere": list}
+WRITTEN_KEYS = {"input", "relit", "settings"}  # what config.toml holds besides
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a run was asked for. sphere: (x, y, z, radius) in the cameras' frame or None. focal: pixels or None. Others: see the flags."""
+
+    capture: str = "auto"
+    quality: str = "standard"
+    seed: int = 0
+    masks: str = "auto"
+    max_side: int | None = None
+    focal: float | None = None
+    sphere: tuple[float, ...] | None = None
+
+
+def plan_job(flags: dict, config: str | Path | None) -> tuple[Job, dict]:
+    """The job from flags and a config file, and the file's settings of the recipe. Raises UserError (2) for unknown keys and values."""
+    content = read_config(config) if config else {}
+    recipe = dict(content.get("settings", {}))
+    values = {}
+    for key, value in content.items():
+        if key in JOB_KEYS:
+            values[key] = tuple(value) if key == "sphere" else value
+        elif key not in WRITTEN_KEYS:
+            recipe[key] = value
+    values.update({k: v for k, v in flags.items() if v is not None})
+    job = with_values(Job(), values, f"--config {config}" if config else "flags")
+    if job.quality not in QUALITIES:
+        what = f"quality '{job.quality}' is not known.{did_you_mean(job.quality, QUALITIES)}"
+        raise UserError(what, f"one of: {', '.join(QUALITIES)}", code=EXIT_USAGE)
+    return job, recipe
+
+
+def capture_kind(asked: str) -> str:
+    """'auto' is multiview until there are other kinds. Raises UserError (code 2) for the kinds of later versions."""
+    if asked in ("auto", *CAPTURES):
+        return "multiview"
+    if asked in LATER:
+        what = f"--capture {asked} is not available in this version"
+        raise UserError(what, "only multiview captures are reconstructed so far", code=EXIT_USAGE)
+    raise UserError(f"--capture {asked} is not known.{did_you_mean(asked, (*CAPTURES, *LATER))}", code=EXIT_USAGE)
+
+
+def open_input(path: Path, job: Job) -> Capture:
+    """`open_capture` with the job's wishes."""
+    from relit.capture import open_capture
+
+    sphere = None if job.sphere is None else Sphere(np.array(job.sphere[:3], dtype=np.float64), float(job.sphere[3]))
+    return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side)
+
+
+def input_digests(capture: Capture, path: Path) -> dict[str, str]:
+    """Content digests of the photos and of the small files (cameras, masks) beside them."""
+    root = capture.root if capture.root.is_dir() else capture.root.parent
+    names = [p.name for p in (*capture.photos, *capture.held_out)]
+    small = [p.name for p in sorted(root.iterdir()) if p.suffix.lower() in (".json", ".txt", ".npz", ".npy", ".bin") and p.is_file()]
+    return digests(root, sorted({n for n in (*names, *small) if (root / n).is_file()}))
+
+
+# ---------------------------------------------------------------- cost
+
+
+@dataclass(frozen=True)
+class Cost:
+    """A rough forecast. seconds: on 2 CPU cores. memory: peak resident bytes. disk: bytes of the run folder."""
+
+    seconds: float
+    memory: float
+    disk: float
+
+
+# Measured on 2 cores at 60 photos of 400x400: (seconds, bytes) by quality, and what each photo adds.
+BASE = {"draft": (60.0, 1.0e9), "standard": (280.0, 1.6e9), "high": (900.0, 2.8e9)}
+SECONDS_PER_PHOTO = {"cameras": 3.0, "load": 0.05}
+BYTES_PER_PIXEL = 24.0  # colour, mask and index of the pixel bank, and one decoded photo at a time
+
+
+def estimate(capture: Capture, job: Job) -> Cost:
+    """Forecast from the number of photos, their pixels and the quality; before the job, so that it can be refused."""
+    pixels = sum(p.width * p.height for p in capture.photos)
+    seconds, memory = BASE[job.quality]
+    seconds += len(capture.photos) * SECONDS_PER_PHOTO["load"]
+    if not capture.has_cameras:
+        seconds += len(capture.photos) * SECONDS_PER_PHOTO["cameras"]
+    return Cost(seconds, memory + BYTES_PER_PIXEL * pixels, 0.3e9 + (0.4e9 if job.quality == "high" else 0))
+
+
+def check_memory(cost: Cost, device: str) -> None:
+    """Raises UserError (code 5) when the job would not fit into memory."""
+    free = available_memory()
+    if free is not None and cost.memory > free:
+        raise UserError(
+            f"the job would take about {readable_bytes(cost.memory)} of memory; {readable_bytes(free)} are available",
+            "the photos are kept decoded while the fit draws pixels from all of them",
+            "use --max-side 800, fewer photos, or --quality draft",
+            code=EXIT_ENVIRONMENT,
+        )

@@ -1,0 +1,63 @@
+"""What an input was recognised as, and what a reconstruction of it would take. `relit inspect`: renders nothing, writes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from relit.log import readable_bytes, readable_seconds
+from relit.plan import Job, estimate, open_input
+from relit.scene import Capture
+
+
+def inspect(input: str | Path, *, quality: str = "standard", masks: str = "auto", sphere=None, max_side: int | None = None) -> dict:
+    """What the input was recognised as, what stands in it, and what a reconstruction would take. Renders nothing, writes nothing."""
+    job = Job(quality=quality, masks=masks, sphere=sphere, max_side=max_side)
+    capture = open_input(Path(input), job)
+    cost = estimate(capture, job)
+    sizes = sorted({(p.width, p.height) for p in capture.photos})
+    ball = capture.sphere and {"centre": [float(x) for x in capture.sphere.centre], "radius": float(capture.sphere.radius)}
+    return {
+        "input": str(input),
+        "format": capture.format,
+        "photos": len(capture.photos),
+        "held_out": len(capture.held_out),
+        "sizes": [list(s) for s in sizes],
+        "cameras": "given" if capture.has_cameras else "none; they would be found from the photos",
+        "sphere": ball,
+        "masks": mask_coverage(capture),
+        "light": "one fixed light is assumed (multiview)",
+        "notes": list(capture.notes),
+        "stages": ([] if capture.has_cameras else ["cameras"]) + ["volume", "surface", "asset", "report"],
+        "estimate": {"seconds": round(cost.seconds), "memory": round(cost.memory), "disk": round(cost.disk), "quality": quality},
+    }
+
+
+def mask_coverage(capture: Capture, views: int = 4) -> dict | None:
+    """Share of each of a few photos that the mask covers, or None when there are no masks."""
+    chosen = [capture.photos[i] for i in np.unique(np.linspace(0, len(capture.photos) - 1, views).round().astype(int))]
+    masks = {p.name: p.load().mask for p in chosen}
+    if any(m is None for m in masks.values()):
+        return None
+    return {name: round(float(mask.mean()), 4) for name, mask in masks.items()}
+
+
+def as_text(found: dict) -> str:
+    """`inspect`'s answer for a reader."""
+    sphere, masks, cost = found["sphere"], found["masks"], found["estimate"]
+    sizes = ", ".join(f"{w}x{h}" for w, h in found["sizes"][:4]) + (" ..." if len(found["sizes"]) > 4 else "")
+    ball = "centre {:.4g} {:.4g} {:.4g}, radius {:.4g}".format(*sphere["centre"], sphere["radius"]) if sphere else "not known yet"
+    forecast = f"{readable_seconds(cost['seconds'])}, {readable_bytes(cost['memory'])} of memory"
+    rows = [
+        ("input", found["input"]),
+        ("recognised as", found["format"]),
+        ("photos", f"{found['photos']} of {sizes} pixels" + (f", {found['held_out']} held out" if found["held_out"] else "")),
+        ("cameras", found["cameras"]),
+        ("object sphere", ball),
+        ("masks", "none" if masks is None else "cover " + ", ".join(f"{100 * c:.0f} % of {n}" for n, c in masks.items())),
+        ("light", found["light"]),
+        ("stages", ", ".join(found["stages"])),
+        ("estimate", f"{forecast} at quality {cost['quality']} on 2 cores"),
+    ]
+    return "\n".join([f"{name.ljust(14)}{value}" for name, value in rows] + [f"note: {n}" for n in found["notes"]])

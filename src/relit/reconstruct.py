@@ -1,0 +1,127 @@
+"""The main job: an input folder into a run folder with its asset and report. `relit reconstruct`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+
+from relit import __version__
+from relit.errors import UserError
+from relit.files import write_text
+from relit.log import readable_bytes, readable_seconds
+from relit.plan import Cost, Job, capture_kind, check_memory, estimate, input_digests, open_input, plan_job
+from relit.run import Run
+from relit.scene import Capture
+from relit.settings import with_pairs, with_values
+
+
+def reconstruct(
+    input: str | Path,
+    out: str | Path,
+    *,
+    device: str = "auto",
+    pairs: Iterable[str] = (),
+    settings: dict | None = None,
+    config: str | Path | None = None,
+    overwrite: bool = False,
+    **flags,
+) -> Path:
+    """Photos -> `out`/asset; returns the asset folder. Giving the same call again resumes or finds it done.
+
+    flags: the fields of `Job`; None means not given. config: a TOML file whose values stand where no flag was given. pairs: 'key=value'
+    texts, settings: {key: value}, both for the fields of `relit.fit.multiview.MultiviewOptions`.
+    Raises UserError for bad input (3), a failed reconstruction (4), a lack of the machine (5), unknown settings (2).
+    """
+    from relit.device import use_device
+
+    job, from_file = plan_job(flags, config)
+    kind = capture_kind(job.capture)
+    apart(Path(input), Path(out))
+    chosen = use_device(device)
+
+    from relit.fit.multiview import options_for
+    from relit.fit.multiview import reconstruct as fit
+
+    options = with_values(options_for(job.quality), from_file, f"--config {config}")
+    options = with_values(with_pairs(options, pairs), settings or {}, "settings")
+    capture = open_input(Path(input), job)
+    cost = estimate(capture, job)
+    check_memory(cost, chosen)
+    record = {"input": Path(input).resolve().name, **dataclasses.asdict(job), "capture": kind, "settings": dataclasses.asdict(options)}
+    with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture, Path(input))) as run:
+        asset_folder = run.folder / "asset"
+        if run.done("asset"):
+            run.say(f"this run is complete: {asset_folder}")
+        else:
+            _begin(run, capture, chosen, cost)
+            capture = with_cameras(capture, run, job)
+            _save(run, fit(capture, run, options, job.seed), capture, kind, job, chosen)
+        if not run.done("report"):
+            from relit.evaluate.report import write_report
+
+            with run.stage("report", title="report"):
+                write_report(run.folder, capture)
+            run.say(f"report: {run.folder / 'report.html'}")
+        return asset_folder
+
+
+def apart(input: Path, out: Path) -> None:
+    """Raises UserError when the run folder would lie in the input or hold it: the run's pictures would be taken for photos."""
+    a, b = input.resolve(), out.resolve()
+    if a == b or b.is_relative_to(a) or a.is_relative_to(b):
+        why = "the run's pictures would be mixed with the photos"
+        raise UserError("the run folder and the input lie in one another", why, f"choose another -o: {out}")
+
+
+def _begin(run: Run, capture: Capture, device: str, cost: Cost) -> None:
+    run.log.note(f"relit {__version__}, Python {platform.python_version()}, {platform.platform()}")
+    run.say(f"{len(capture.photos)} photos ({capture.format}), {'cameras given' if capture.has_cameras else 'no cameras'}, on {device}")
+    for note in capture.notes:
+        run.say(f"note: {note}")
+    run.say(f"about {readable_seconds(cost.seconds)} and {readable_bytes(cost.memory)} of memory on 2 cores")
+
+
+def with_cameras(capture: Capture, run: Run, job: Job) -> Capture:
+    """The capture with cameras: its own, or found from the photos (stage 'cameras', kept for a resume)."""
+    if capture.has_cameras:
+        return capture
+    from relit.cameras.sfm import find_cameras
+
+    # the finder keeps its own model in the stage's folder, so a second call after a stop is cheap
+    if run.done("cameras"):
+        return find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=job.focal)[0]
+    with run.stage("cameras", title="cameras from photos") as stage:
+        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=job.focal)
+    run.say(str(verdict))
+    return found
+
+
+def _save(run: Run, asset, capture: Capture, kind: str, job: Job, device: str) -> None:
+    from relit.asset.asset import save_asset
+
+    stages = run.stages()
+    meta = {
+        **asset.meta,
+        "capture": kind,
+        "quality": job.quality,
+        "seed": job.seed,
+        "device": device,
+        "versions": versions(),
+        "stages": {s["name"]: {"seconds": s["seconds"], "peak_memory": s["peak_memory"]} for s in stages},
+        "seconds": round(sum(s["seconds"] for s in stages), 1),
+        "peak_memory": max((s["peak_memory"] for s in stages), default=0),
+        "inputs": json.loads((run.folder / "inputs.json").read_text()),
+    }
+    with run.stage("asset", title="asset") as stage:
+        save_asset(run.folder / "asset", dataclasses.replace(asset, meta=meta))
+        write_text(stage.folder / "notes.json", json.dumps(list(capture.notes)))
+
+
+def versions() -> dict[str, str]:
+    """What made the asset."""
+    from importlib.metadata import version
+
+    return {"relit": __version__, "python": platform.python_version(), **{n: version(n) for n in ("mitsuba", "drjit", "numpy")}}

@@ -1,0 +1,225 @@
+"""The command line: verbs, flags in any order, suggestions, exit codes, and no stack trace for a user."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from relit import cli, verbs
+from relit.errors import UserError
+from relit.settings import convert, with_pairs, with_values
+
+
+def run(capsys, *argv):
+    code = cli.main([str(a) for a in argv])
+    out = capsys.readouterr()
+    return code, out.out, out.err
+
+
+def test_help_is_quick():
+    best = 9.0
+    for _ in range(3):
+        begun = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "relit", "reconstruct", "--help"], check=True, capture_output=True)
+        best = min(best, time.perf_counter() - begun)
+    job = "import sys; from relit.cli import main; main(['evaluate', '--help']); "
+    job += "print('LOADED', {'mitsuba', 'scipy', 'cv2'} & set(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", job], check=True, capture_output=True, text=True).stdout
+    assert out.endswith("LOADED set()\n")
+    assert best < 1.0  # 0.2 s on an idle machine
+
+
+def test_overview_lists_what_there_is(capsys):
+    for argv in ((), ("--help",), ("-h",)):
+        code, out, _ = run(capsys, *argv)
+        assert code == 0
+        assert all(f"  {verb} " in out for verb in verbs.VERBS)
+        assert not any(f"  {later} " in out for later in ("view", "edit", "insert", "quadrants"))
+    assert run(capsys, "--version")[1].startswith("relit 0.")
+
+
+@pytest.mark.parametrize("verb", list(verbs.VERBS))
+def test_every_verb_has_help_with_common_flags_first(capsys, verb):
+    code, out, _ = run(capsys, verb, "--help")
+    assert code == 0 and f"usage: relit {verb}" in out
+    if "more flags:" in out:
+        assert out.index("common flags:") < out.index("more flags:")
+
+
+@pytest.mark.parametrize(
+    "argv, said",
+    [
+        (["recnstruct", "x"], "unknown verb 'recnstruct'. Did you mean 'reconstruct'?"),
+        (["view", "x"], "unknown verb 'view'"),
+        (["--qualty", "draft", "reconstruct"], "unknown flag '--qualty' before the verb"),
+        (["reconstruct", "x", "-o", "y", "--qualty", "draft"], "unknown flag '--qualty'. Did you mean '--quality'?"),
+        (["reconstruct", "x", "--overwite"], "Did you mean '--overwrite'?"),
+        (["reconstruct", "x", "-o", "y", "--quality", "drft"], "--quality drft is not known. Did you mean 'draft'?"),
+        (["reconstruct", "x", "-o", "y", "--qual", "draft"], "unknown flag '--qual'"),
+        (["reconstruct", "x"], "missing: -o/--out"),
+        (["reconstruct", "-o", "y"], "missing: input"),
+        (["reconstruct", "x", "y", "-o", "z"], "unexpected 'y'"),
+        (["reconstruct", "x", "-o", "y", "--sphere", "1,2,3"], "'1,2,3' is not X,Y,Z,RADIUS"),
+        (["reconstruct", "x", "-o", "y", "--sphere", "0,0,0,-1"], "is not X,Y,Z,RADIUS"),
+        (["reconstruct", "x", "-o", "y", "--seed", "many"], "invalid int value: 'many'"),
+        (["reconstruct", "x", "-o", "y", "--capture", "flash"], "--capture flash is not available in this version"),
+        (["reconstruct", "x", "-o", "y", "--config", "nowhere.toml"], "configuration file is not there"),
+        (["synthesize", "flash", "--asset", "a", "--light", "b", "-o", "c"], "synthesize flash is not available"),
+        (["synthesize", "multiview", "--asset", "a", "--light", "b", "c", "-o", "d"], "has one light"),
+        (["synthesize", "multview", "--asset", "a", "--light", "b", "-o", "c"], "Did you mean 'multiview'?"),
+        (["export", "x", "-o", "y.stl"], "cannot be told from the ending"),
+        (["evaluate", "x"], "missing: --truth"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(capsys, tmp_path, monkeypatch, argv, said):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *argv)
+    assert code == 2 and said in err and "Traceback" not in err and out == ""
+    assert err.startswith("error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_flags_stand_in_any_order_and_values_may_be_negative(tmp_path):
+    parser = verbs.parser_for("reconstruct")
+    words = ["--quality", "draft", "photos", "--set", "a=1", "-o", "run", "--sphere", "-1,.5,0,2", "--set=b=2"]
+    args = parser.parse(words)
+    assert (str(args.input), str(args.out), args.quality) == ("photos", "run", "draft")
+    assert args.sphere == (-1.0, 0.5, 0.0, 2.0) and args.pairs == ["a=1", "b=2"]
+    assert verbs.parser_for("reconstruct").parse(["photos", "-o", "run"]).quality is None
+
+
+def stub(monkeypatch, act):
+    monkeypatch.setitem(verbs.VERBS, "doctor", verbs.Verb("stub", lambda parser: None, act))
+
+
+def test_a_user_error_is_said_in_full_with_its_code(capsys, monkeypatch):
+    def act(args):
+        raise UserError("3 photos of 60 are empty", "the camera ran out of power", "remove them: a.jpg", code=4)
+
+    stub(monkeypatch, act)
+    code, _, err = run(capsys, "doctor")
+    assert code == 4
+    assert err == "error: 3 photos of 60 are empty\nwhy: the camera ran out of power\nfix: remove them: a.jpg\n"
+    monkeypatch.setenv("RELIT_DEBUG", "1")
+    assert "Traceback" in run(capsys, "doctor")[2]
+
+
+def test_an_unexpected_error_is_one_line_and_a_file(capsys, monkeypatch, tmp_path):
+    def act(args):
+        raise KeyError("lost")
+
+    stub(monkeypatch, act)
+    code, _, err = run(capsys, "doctor")
+    path = err.split("report it with ")[1].strip()
+    assert code == 1 and "Traceback" not in err and "KeyError" in err
+    text = Path(path).read_text()
+    assert "Traceback" in text and "in act" in text
+    (tmp_path / "log.txt").write_text("before\n")
+    monkeypatch.setitem(verbs.VERBS, "doctor", verbs.Verb("stub", lambda p: p.add_argument("-o"), act))
+    _, _, err = run(capsys, "doctor", "-o", tmp_path)
+    assert str(tmp_path / "log.txt") in err
+    assert (tmp_path / "log.txt").read_text().startswith("before\n") and "in act" in (tmp_path / "log.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    "error, code, said",
+    [
+        (OSError(28, "No space left on device"), 5, "the disk is full"),
+        (MemoryError("Unable to allocate 80 GiB"), 5, "out of memory: Unable to allocate"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_lacks_of_the_machine(capsys, monkeypatch, error, code, said):
+    def act(args):
+        raise error
+
+    stub(monkeypatch, act)
+    got, _, err = run(capsys, "doctor")
+    assert got == code and said in err and "Traceback" not in err
+
+
+def test_sigterm_is_exit_code_143(capsys, monkeypatch):
+    import os
+
+    def act(args):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(1)
+
+    before = signal.getsignal(signal.SIGTERM)
+    stub(monkeypatch, act)
+    assert run(capsys, "doctor")[0] == 143
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_doctor_prints_json(capsys, monkeypatch):
+    from relit import doctor
+
+    checks = [doctor.Check("gradient on cpu", True, "fine"), doctor.Check("disk", False, "full", "rm x")]
+    monkeypatch.setattr(doctor, "examine", lambda: checks)
+    code, out, _ = run(capsys, "doctor", "--json")
+    assert code == 5 and json.loads(out)["checks"][1]["fix"] == "rm x"
+
+
+def test_outputs_are_not_overwritten(capsys, tmp_path):
+    there = tmp_path / "a.glb"
+    there.write_bytes(b"mine")
+    code, _, err = run(capsys, "export", tmp_path, "-o", there)
+    assert code == 3 and "nothing was overwritten" in err and there.read_bytes() == b"mine"
+
+
+# ---------------------------------------------------------------- settings
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    rate: float = 0.5
+    steps: tuple[int, ...] = (1, 2)
+    band: tuple[float, float] = (0.0, 1.0)
+    shadows: bool = True
+    light: Literal["map", "none"] = "map"
+    limit: int | None = None
+
+    def __post_init__(self):
+        if self.rate < 0:
+            raise ValueError("rate is negative")
+
+
+def test_settings_are_parsed_by_type():
+    got = with_pairs(Options(), ["rate=1e-2", "steps=3,4,5", "band=[.5, 2]", "shadows=off", "light=none", "limit=7"])
+    assert got == Options(0.01, (3, 4, 5), (0.5, 2.0), False, "none", 7)
+    assert with_values(got, {"limit": None, "steps": [8]}, "file") == Options(0.01, (8,), (0.5, 2.0), False, "none", None)
+
+
+@pytest.mark.parametrize(
+    "pair, said",
+    [
+        ("rat=1", "unknown key 'rat'. Did you mean 'rate'?"),
+        ("rate", "no '='"),
+        ("rate=fast", "rate=fast is no number"),
+        ("steps=1.5", "is no list of whole number"),
+        ("band=1,2,3", "is no list of number"),
+        ("shadows=maybe", "is no true or false"),
+        ("light=sun", "is no one of map, none"),
+        ("rate=-1", "rate is negative"),
+    ],
+)
+def test_wrong_settings_are_exit_code_2(pair, said):
+    with pytest.raises(UserError) as caught:
+        with_pairs(Options(), [pair])
+    assert said in caught.value.what and caught.value.code == 2
+
+
+def test_convert_refuses_what_it_does_not_know():
+    with pytest.raises(ValueError):
+        convert("x", types.SimpleNamespace)
+    with pytest.raises(ValueError):
+        convert(True, int)
