@@ -43,25 +43,30 @@ class Image:
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says before it is decoded: upright width and height in pixels, has alpha, EXIF focal length in pixels or None."""
+    """What a file says before it is decoded.
+
+    width, height: pixels, upright. alpha: has an alpha channel. focal: EXIF focal length in pixels, or None.
+    turned: the EXIF orientation swaps the sides.
+    """
 
     width: int
     height: int
     alpha: bool = False
     focal: float | None = None
+    turned: bool = False
 
 
 # ---------------------------------------------------------------- reading
 
 
-def read_image(path: str | Path) -> Image:
-    """Decode a photo to linear float32, EXIF orientation applied once.
+def read_image(path: str | Path, upright: bool = True) -> Image:
+    """Decode a photo to linear float32, EXIF orientation applied once (or not at all with upright=False).
 
     8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed), EXR and HDR (linear already), HEIC and RAW with the optional extras.
     Raises UserError for a missing, truncated, oversized or unknown file and for NaN or infinite pixels.
     """
     path = Path(path)
-    array, is_linear = _decode(path)
+    array, is_linear = _decode(path, upright)
     alpha, clipped = None, None
     if array.ndim == 2:
         array = array[..., None]
@@ -77,6 +82,36 @@ def read_image(path: str | Path) -> Image:
         if alpha is not None:  # coded formats store straight alpha, EXR premultiplied
             rgb = rgb * alpha[..., None]
     return Image(np.ascontiguousarray(rgb), alpha, clipped)
+
+
+def read_small(path: str | Path, side: int = 256) -> Image:
+    """A small version of `read_image` (longest side about `side` pixels) for looking at many photos quickly; linear, upright.
+
+    JPEG files are decoded at reduced size. Alpha is kept apart: rgb is NOT composited. `clipped` is None.
+    """
+    import cv2
+
+    path = Path(path)
+    suffix = _checked(path)
+    if suffix in FLOAT | RAW:
+        image = read_image(path)
+        h, w = image.rgb.shape[:2]
+        size = (max(1, round(w * side / max(w, h))), max(1, round(h * side / max(w, h)))) if max(w, h) > side else (w, h)
+        alpha = None if image.alpha is None else cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA)
+        return Image(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), alpha)
+    with _pil(path) as image:
+        try:
+            image.draft("RGB", (side, side))
+            has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+            if image.mode.startswith("I"):
+                codes = read_data(path)
+                image = PilImage.fromarray(_codes(codes))
+            small = ImageOps.exif_transpose(image.convert("RGBA" if has_alpha else "RGB"))
+            small = small.reduce(max(1, max(small.size) // side)) if max(small.size) >= 2 * side else small
+            array = _unit(np.array(small))
+        except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
+            raise _broken(path, str(error)) from error
+    return Image(linear_from_srgb(array[..., :3]), array[..., 3] if has_alpha else None)
 
 
 def read_data(path: str | Path) -> np.ndarray:
@@ -103,10 +138,10 @@ def read_header(path: str | Path) -> Header:
     with _pil(path) as image:
         w, h = image.size
         exif = image.getexif()
-        if exif.get(0x0112, 1) in (5, 6, 7, 8):
-            w, h = h, w
+        turned = exif.get(0x0112, 1) in (5, 6, 7, 8)
+        w, h = (h, w) if turned else (w, h)
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-        return Header(w, h, has_alpha, _focal(exif, w, h))
+        return Header(w, h, has_alpha, _focal(exif, w, h), turned)
 
 
 def _focal(exif, width: int, height: int) -> float | None:
@@ -149,7 +184,7 @@ def _too_large(path: Path, width: int, height: int) -> None:
         )
 
 
-def _decode(path: Path) -> tuple[np.ndarray, bool]:
+def _decode(path: Path, upright: bool = True) -> tuple[np.ndarray, bool]:
     """-> ((H, W[, C]) uint8, uint16 or float32 array, True when it is linear already)."""
     suffix = _checked(path)
     if suffix == ".exr":
@@ -169,8 +204,8 @@ def _decode(path: Path) -> tuple[np.ndarray, bool]:
     with _pil(path) as image:
         try:
             if _is_sixteen_bit(path, suffix):
-                return _sixteen_bit(path, image.getexif().get(0x0112, 1)), False
-            image = ImageOps.exif_transpose(image)
+                return _sixteen_bit(path, image.getexif().get(0x0112, 1) if upright else 1), False
+            image = ImageOps.exif_transpose(image) if upright else image
             if image.mode in ("P", "PA") or "transparency" in image.info:
                 image = image.convert("RGBA")
             elif image.mode in ("1", "CMYK", "YCbCr", "HSV", "LAB"):

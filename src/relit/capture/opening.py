@@ -1,0 +1,244 @@
+"""`open_capture`: recognise what a folder holds, read it, say what was done."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from relit.cameras.pinhole import lens_of
+from relit.capture import colmap_model, idr, llff, middlebury, photo, transforms_json
+from relit.capture.frames import Frame, Reading
+from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
+from relit.errors import UserError, did_you_mean
+from relit.images import Header, read_small
+from relit.masks.files import find_mask, index_masks, judge, read_mask
+from relit.masks.grabcut import grabcut
+from relit.masks.segment import segmenter
+from relit.masks.threshold import Backdrop, find_backdrop
+from relit.scene import Capture, Photo, Sphere
+
+READERS = {  # in this order; the first that recognises the folder reads it
+    "transforms": transforms_json,
+    "idr": idr,
+    "middlebury": middlebury,
+    "colmap": colmap_model,
+    "llff": llff,
+    "photos": photo,
+}
+MASKS = ("auto", "none", "alpha", "files", "threshold", "grabcut", "segment")
+SMALL = 256  # pixels, longest side of the copies that masks are judged on
+LOOKED_AT = 12  # photos that are looked at for a plain backdrop
+
+
+def open_capture(
+    path: str | Path, *, sphere: Sphere | None = None, masks: str = "auto", max_side: int | None = None, min_photos: int = 3
+) -> Capture:
+    """Read a capture of any known format; photos decode later, when `Photo.load` is called.
+
+    sphere: the object sphere in the units of the cameras; found when not given. masks: 'auto' takes alpha channels, else mask files, else
+    a plain backdrop, else none; 'none', 'alpha', 'files', 'threshold', 'grabcut', 'segment' ask for one kind.
+    max_side: photos are resized to at most so many pixels. min_photos: fewer photos are an error.
+    Raises UserError (exit code 3) for everything that is wrong with the input.
+    """
+    path = Path(path).expanduser()
+    if masks not in MASKS:
+        raise UserError(f"unknown kind of masks '{masks}'.{did_you_mean(masks, MASKS)}", fix=f"choose one of {', '.join(MASKS)}", code=2)
+    if not path.exists():
+        raise UserError("the input is not there", fix=f"check the path: {path}")
+    reading = _read(path)
+    headers = photo.headers_of(reading.frames)
+    notes = list(reading.notes) + _size_notes(reading, headers)
+    training = sum(not f.held_out for f in reading.frames)
+    if training < min_photos:
+        raise UserError(
+            f"{training} photo{'s are' if training != 1 else ' is'} not enough: at least {min_photos} are needed",
+            "shape is found by comparing photos from different sides",
+            f"add photos, 30 to 80 all around the object are good: {reading.root}",
+        )
+    normals = photo.index_normals(reading.root)
+    photos = [photo.photo_from(f, h, max_side, normals) for f, h in zip(reading.frames, headers, strict=True)]
+    if any(p.load.normal for p in photos):
+        notes.append(f"{sum(p.load.normal is not None for p in photos)} photos have normal priors")
+    photos, small, dark = _masked(reading, headers, photos, masks, notes)
+    dropped = {i for i, m in enumerate(small) if m is not None and not (m > 0.5).any() and not reading.frames[i].held_out}
+    views = [View(f.camera, f.lens or lens_of(f.camera), m) if f.camera else None for f, m in zip(reading.frames, small, strict=True)]
+    photos = [with_calibration(p, f) for p, f in zip(photos, reading.frames, strict=True)]
+    train = [i for i, f in enumerate(reading.frames) if not f.held_out and i not in dropped]
+    held = [i for i, f in enumerate(reading.frames) if f.held_out]
+
+    up = None
+    if all(views[i] is not None for i in train):
+        cameras = [photos[i].camera for i in train]
+        sphere = sphere or reading.sphere
+        if sphere is None:
+            sphere, source = find_sphere([views[i] for i in train], reading.points)
+            notes.append(f"the object sphere was found from {source}")
+        notes += check_sphere(sphere, cameras)
+        up = up_direction(cameras)
+        if masks == "grabcut":
+            photos = [_cut(p, sphere) for p in photos]
+            notes.append("masks were guessed by GrabCut from the object sphere; look at them")
+    elif masks == "grabcut":
+        raise UserError("GrabCut needs cameras", "it is seeded by the object sphere", "find the cameras first, or give mask files")
+    return Capture(
+        root=reading.root,
+        format=reading.format,
+        photos=tuple(photos[i] for i in train),
+        held_out=tuple(photos[i] for i in held),
+        sphere=sphere,
+        points=reading.points,
+        up=up,
+        black_background=dark,
+        notes=tuple(notes),
+    )
+
+
+def with_calibration(p: Photo, frame: Frame) -> Photo:
+    """The photo with the camera of its frame, undistorted; as it is when the frame has none."""
+    return p if frame.camera is None else photo.with_camera(p, frame.camera, frame.lens)
+
+
+def _read(path: Path) -> Reading:
+    """The reading of the first format that recognises `path`."""
+    for module in READERS.values():
+        found = module.recognise(path)
+        if found is not None:
+            return module.read(path, found)
+    looked = "; ".join(m.LOOKED_FOR for m in READERS.values())
+    if path.is_file():
+        raise UserError(
+            "the input is no capture",
+            f"a folder is expected, or one of its camera files; looked for {looked}",
+            f"give the folder of: {path}",
+        )
+    some = sorted(p.name + ("/" if p.is_dir() else "") for p in path.iterdir())[:8]
+    raise UserError(
+        "no images were found",
+        f"looked for {looked}; the folder holds {', '.join(some) if some else 'nothing'}",
+        f"give the folder that holds the photos: {path}",
+    )
+
+
+def _size_notes(reading: Reading, headers: list[Header]) -> list[str]:
+    sizes = Counter((h.width, h.height) for h in headers)
+    if len(sizes) <= 1:
+        return []
+    text = ", ".join(f"{n} of {w} x {h}" for (w, h), n in sizes.most_common(4))
+    has_cameras = reading.frames[0].camera is not None
+    return [
+        f"the photos have {len(sizes)} sizes ({text}): "
+        + ("each has its own camera" if has_cameras else "each size gets its own focal length")
+    ]
+
+
+# ---------------------------------------------------------------- masks
+
+
+def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted: str, notes: list[str]):
+    """-> (photos that know their masks, small masks (h, w) or None, True when the background is black)."""
+    none = [None] * len(photos)
+    if wanted in ("auto", "alpha") and all(h.alpha for h in headers):
+        small = [read_small(f.path, SMALL).alpha for f in reading.frames]
+        if wanted == "alpha" or any((a < 0.5).any() for a in small):
+            _, empty = judge({f.name: a for f, a in zip(reading.frames, small, strict=True)}, "the alpha channel")
+            _say_empty(empty, notes)
+            notes.append("masks come from the alpha channel; the photos are composited on black")
+            return [_with(p, mask=True) for p in photos], small, True
+        notes.append("the alpha channel is opaque everywhere: it is no mask")
+    elif wanted == "alpha":
+        raise UserError(
+            f"{sum(not h.alpha for h in headers)} of {len(headers)} photos have no alpha channel",
+            fix="give mask files, or another kind of masks",
+        )
+    if wanted in ("auto", "files"):
+        result = _from_files(reading, photos, wanted == "files", notes)
+        if result is not None:
+            return result
+    if wanted in ("auto", "threshold"):
+        result = _from_backdrop(reading, photos, wanted == "threshold", notes)
+        if result is not None:
+            return result
+    if wanted == "segment":
+        mask_of = segmenter()
+        masks = [mask_of(p.load().rgb) for p in photos]
+        judge({p.name: m for p, m in zip(photos, masks, strict=True)}, "the segmenter")
+        notes.append("masks were found by the segmenter; look at them")
+        return [photo.with_mask(p, m) for p, m in zip(photos, masks, strict=True)], masks, False
+    return photos, none, False
+
+
+def _with(p: Photo, **changes) -> Photo:
+    return replace(p, load=replace(p.load, **changes))
+
+
+def _say_empty(empty: list[str], notes: list[str]) -> None:
+    if empty:
+        notes.append(f"{len(empty)} photos have an empty mask and are not used, for example {empty[0]}")
+
+
+def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
+    folder, index = index_masks(reading.root)
+    files = [f.mask or find_mask(f.path, reading.root, index) for f in reading.frames]
+    missing = [f.name for f, m in zip(reading.frames, files, strict=True) if m is None or not m.is_file()]
+    train = [f.name for f in reading.frames if not f.held_out]
+    if folder is None and not asked and len(missing) == len(files):
+        return None
+    if set(missing) & set(train):
+        lacking = [n for n in missing if n in set(train)]
+        raise UserError(
+            f"{len(lacking)} of {len(train)} photos have no mask, for example {lacking[0]}",
+            f"masks were looked for in {folder.name}/ by the photos' names"
+            if folder
+            else "no mask folder was found and no file ends in _mask.png",
+            f"add the masks, or use --set masks=none: {folder or reading.root}",
+        )
+    small = [None if m is None or not m.is_file() else _shrunk(read_mask(m)) for m in files]
+    where = f"{folder.name}/" if folder else "the mask files"
+    inverted, empty = judge({f.name: m for f, m in zip(reading.frames, small, strict=True) if m is not None}, where)
+    small = [1.0 - m if inverted and m is not None else m for m in small]
+    notes.append(f"masks come from {where}")
+    if inverted:
+        notes.append("the masks were white off the object and have been inverted")
+    _say_empty(empty, notes)
+    return [_with(p, mask=m, invert=inverted) for p, m in zip(photos, files, strict=True)], small, False
+
+
+def _shrunk(mask: np.ndarray) -> np.ndarray:
+    import cv2
+
+    s = SMALL / max(mask.shape)
+    return (
+        mask
+        if s >= 1
+        else cv2.resize(mask, (max(1, round(mask.shape[1] * s)), max(1, round(mask.shape[0] * s))), interpolation=cv2.INTER_AREA)
+    )
+
+
+def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
+    step = max(1, len(photos) // LOOKED_AT)
+    looked = [read_small(f.path, SMALL).rgb for f in reading.frames[::step]]
+    backdrop: Backdrop | None = find_backdrop(looked)
+    if backdrop is None:
+        if asked:
+            raise UserError(
+                "the photos do not stand before a plain backdrop",
+                "their borders are not of one colour",
+                "give mask files, or use --set masks=none to fit the background as well",
+            )
+        return None
+    small = [backdrop(read_small(f.path, SMALL).rgb) for f in reading.frames]
+    _, empty = judge({f.name: m for f, m in zip(reading.frames, small, strict=True)}, "the threshold")
+    _say_empty(empty, notes)
+    kind = "dark" if backdrop.dark else "plain"
+    notes.append(
+        f"masks were found by a threshold before the {kind} backdrop"
+        + ("; what lies outside them is set to black" if backdrop.dark else "")
+    )
+    return [_with(p, mask=backdrop) for p in photos], small, backdrop.dark
+
+
+def _cut(p: Photo, sphere: Sphere) -> Photo:
+    return photo.with_mask(p, grabcut(p.load().rgb, p.camera, sphere))

@@ -1,0 +1,221 @@
+"""From a file to a `Photo` that decodes when it is asked: upright, linear, masked, resized, undistorted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from relit.cameras.pinhole import Lens, lens_of, undistorted_camera, undistortion_map
+from relit.capture.frames import Frame, Reading, image_folder, list_images
+from relit.errors import UserError
+from relit.images import EXTENSIONS, Header, read_data, read_header, read_image
+from relit.masks.files import read_mask
+from relit.masks.threshold import Backdrop
+from relit.scene import Camera, Photo, Pixels
+
+NORMAL_FOLDERS = ("normals", "normal")
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """Reads one photo file. Called without arguments it returns the upright `Pixels` at `size` (width, height), lens distortion kept.
+
+    mask: a file, a backdrop, True for the file's own alpha channel, or None. invert: the mask file is white off the object.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    upright: bool = True
+    mask: Path | Backdrop | bool | None = None
+    invert: bool = False
+    normal: Path | None = None
+
+    def __call__(self) -> Pixels:
+        image = read_image(self.path, self.upright)
+        rgb, clipped = image.rgb, image.clipped
+        shape = rgb.shape[:2]
+        mask = None
+        if self.mask is True:
+            mask = image.alpha
+        elif isinstance(self.mask, Path):
+            mask = file_mask(self.mask, shape, self.invert)
+        elif isinstance(self.mask, Backdrop):
+            mask = self.mask(rgb)
+            if self.mask.dark:
+                rgb = rgb * mask[..., None]
+        normal = None if self.normal is None else read_normal(self.normal, shape)
+        w, h = self.size
+        if (h, w) != shape:
+            rgb = cv2.resize(rgb, (w, h), interpolation=cv2.INTER_AREA)
+            mask = None if mask is None else cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
+            clipped = None if clipped is None else cv2.resize(clipped.astype(np.uint8), (w, h), interpolation=cv2.INTER_LINEAR) > 0
+            normal = None if normal is None else _unit_normals(cv2.resize(normal, (w, h), interpolation=cv2.INTER_AREA))
+        return Pixels(rgb, mask, normal, clipped)
+
+
+@dataclass(frozen=True)
+class Undistorted:
+    """Takes the lens distortion out of what `load` returns."""
+
+    load: Callable[[], Pixels]
+    camera: Camera
+    lens: Lens
+    ideal: Camera
+
+    def __call__(self) -> Pixels:
+        pixels = self.load()
+        x, y = _cached_map(_Key(self.camera, self.lens, self.ideal))
+
+        def warp(a, flag=cv2.INTER_LINEAR):
+            return None if a is None else cv2.remap(a, x, y, flag, borderMode=cv2.BORDER_REPLICATE)
+
+        clipped = None if pixels.clipped is None else warp(pixels.clipped.astype(np.float32)) > 0
+        normal = None if pixels.normal is None else _unit_normals(warp(pixels.normal))
+        return Pixels(warp(pixels.rgb), warp(pixels.mask), normal, clipped)
+
+
+@dataclass(frozen=True)
+class Masked:
+    """Lays a stored mask (bits packed) over what `load` returns."""
+
+    load: Callable[[], Pixels]
+    bits: bytes
+    shape: tuple[int, int]
+
+    def __call__(self) -> Pixels:
+        h, w = self.shape
+        mask = np.unpackbits(np.frombuffer(self.bits, np.uint8), count=h * w).reshape(h, w).astype(np.float32)
+        return replace(self.load(), mask=mask)
+
+
+def with_mask(photo: Photo, mask: np.ndarray) -> Photo:
+    """The photo with another mask (H, W), kept in memory at one bit a pixel."""
+    return replace(photo, load=Masked(photo.load, np.packbits(mask > 0.5).tobytes(), mask.shape))
+
+
+class _Key:
+    """Cache key: cameras that differ only in pose share their undistortion map."""
+
+    def __init__(self, camera: Camera, lens: Lens, ideal: Camera):
+        self.parts = (camera, lens, ideal)
+        self.values = (lens, *((c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.distortion) for c in (camera, ideal)))
+
+    def __hash__(self) -> int:
+        return hash(self.values)
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, _Key) and self.values == other.values
+
+
+@lru_cache(maxsize=4)
+def _cached_map(key: _Key) -> tuple[np.ndarray, np.ndarray]:
+    return undistortion_map(*key.parts)
+
+
+def with_camera(photo: Photo, camera: Camera, lens: Lens | None = None) -> Photo:
+    """Give a photo (as decoded, distortion in it) its camera, in pixels of any size of the same shape; undistort it if need be."""
+    camera = camera.resized(photo.width, photo.height) if (camera.width, camera.height) != (photo.width, photo.height) else camera
+    lens = lens or lens_of(camera)
+    ideal = undistorted_camera(camera, lens)
+    if lens is None:
+        return replace(photo, camera=ideal)
+    return replace(photo, camera=ideal, width=ideal.width, height=ideal.height, load=Undistorted(photo.load, camera, lens, ideal))
+
+
+def photo_from(frame: Frame, header: Header, max_side: int | None, normals: dict[str, Path] | None = None) -> Photo:
+    """A `Photo` without camera or mask. Raises UserError when camera and file have different shapes."""
+    w, h, upright = header.width, header.height, True
+    camera = frame.camera
+    if camera is not None and abs(camera.width / camera.height - w / h) > 0.02 * (w / h):
+        if header.turned and abs(camera.width / camera.height - h / w) < 0.02 * (h / w):
+            w, h, upright = h, w, False  # calibrated on the picture as stored, before EXIF turned it
+        else:
+            raise UserError(
+                f"camera and photo have different shapes: {camera.width} x {camera.height} and {w} x {h} pixels ('{frame.name}')",
+                "the photo was cropped or turned after the cameras were found, or one set of intrinsics is used for photos of mixed sizes",
+                f"use the photos that the cameras were made for: {frame.path}",
+            )
+    if max_side is not None and max(w, h) > max_side:
+        s = max_side / max(w, h)
+        size = (max(1, round(w * s)), max(1, round(h * s)))
+    else:
+        size = (w, h)
+    focal = None if header.focal is None else header.focal * size[0] / w
+    normal = find_normal(frame.path, normals or {})
+    return Photo(frame.name, Decoder(frame.path, size, upright, normal=normal), *size, focal_hint=focal)
+
+
+# ---------------------------------------------------------------- masks and normals from files
+
+
+def file_mask(path: Path, shape: tuple[int, int], invert: bool = False) -> np.ndarray:
+    """A mask file at the size of its photo (H, W). Raises UserError when the shapes differ."""
+    mask = read_mask(path)
+    h, w = shape
+    if mask.shape != (h, w):
+        if abs(mask.shape[1] / mask.shape[0] - w / h) > 0.02 * (w / h):
+            raise UserError(
+                f"a mask and its photo have different shapes: {mask.shape[1]} x {mask.shape[0]} and {w} x {h} pixels",
+                "the mask belongs to another photo, or one of them was turned",
+                f"make it again from the photo: {path}",
+            )
+        mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA if mask.shape[0] > h else cv2.INTER_LINEAR)
+    return 1.0 - mask if invert else np.ascontiguousarray(mask, dtype=np.float32)
+
+
+def index_normals(root: Path) -> dict[str, Path]:
+    """Normal priors in normals/ by stem."""
+    for name in NORMAL_FOLDERS:
+        folder = root / name
+        if folder.is_dir():
+            return {f.stem.removesuffix("_normal"): f for f in sorted(folder.rglob("*")) if f.suffix.lower() in EXTENSIONS}
+    return {}
+
+
+def find_normal(photo: Path, index: dict[str, Path]) -> Path | None:
+    """The normal prior of a photo: STEM_normal.png or .exr beside it, or the same stem in the folder that was indexed."""
+    for suffix in (".png", ".exr"):
+        beside = photo.parent / f"{photo.stem}_normal{suffix}"
+        if beside.is_file():
+            return beside
+    return index.get(photo.stem)
+
+
+def read_normal(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W, 3) unit normals in OpenCV camera axes: a picture maps [-1, 1] to [0, 1], an EXR holds them as they are."""
+    data = read_data(path)
+    if data.ndim != 3 or data.shape[2] < 3:
+        raise UserError("a normal prior has no three channels", fix=f"write x, y, z as red, green, blue: {path}")
+    normal = data[..., :3] if path.suffix.lower() == ".exr" else data[..., :3] * 2 - 1
+    if normal.shape[:2] != shape:
+        normal = cv2.resize(np.ascontiguousarray(normal), shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return _unit_normals(normal)
+
+
+def _unit_normals(normal: np.ndarray) -> np.ndarray:
+    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)).astype(np.float32)
+
+
+# ---------------------------------------------------------------- the plain folder
+
+LOOKED_FOR = "photos in the folder itself or in images/, image/, rgb/, input/ or photos/"
+
+
+def recognise(path: Path) -> Path | None:
+    """The folder with the photos, or None."""
+    return image_folder(path) if path.is_dir() else None
+
+
+def read(path: Path, found: Path) -> Reading:
+    """All photos of a folder, without cameras."""
+    return Reading("photos", path, tuple(Frame(f, f.relative_to(path).as_posix()) for f in list_images(found)))
+
+
+def headers_of(frames: tuple[Frame, ...]) -> list[Header]:
+    """Headers of all files; the first damaged one raises UserError."""
+    return [read_header(f.path) for f in frames]

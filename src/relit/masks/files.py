@@ -1,0 +1,129 @@
+"""Mask files beside the photos, and what can be wrong with them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from relit.errors import UserError
+from relit.images import EXTENSIONS, read_data
+
+FOLDERS = ("masks", "mask", "segmentations", "silhouettes")
+BORDER = 0.9  # an inverted mask covers at least this share of the photo's border
+
+
+def find_mask(photo: Path, root: Path, index: dict[str, Path]) -> Path | None:
+    """The mask of a photo: STEM_mask.png or STEM.mask.png beside it, else a file of the same name, stem or number in a mask folder."""
+    for name in (f"{photo.stem}_mask", f"{photo.stem}.mask"):
+        for suffix in (".png", ".jpg"):
+            if (photo.parent / (name + suffix)).is_file():
+                return photo.parent / (name + suffix)
+    relative = photo.relative_to(root).as_posix() if photo.is_relative_to(root) else photo.name
+    without_top = relative.split("/", 1)[-1]
+    for key in (without_top + ".png", without_top, str(Path(without_top).with_suffix("")), photo.name, photo.stem, f"{photo.stem}_mask"):
+        if key in index:
+            return index[key]
+    number = _number(photo.stem)
+    return index.get(f"#{number}") if number is not None else None
+
+
+def index_masks(root: Path) -> tuple[Path | None, dict[str, Path]]:
+    """The mask folder of a capture (or None) and its files by relative name, name, stem and number."""
+    for base in dict.fromkeys([root, root.parent if root.name in ("images", "image") else root]):
+        for name in FOLDERS:
+            folder = base / name
+            files = sorted(f for f in folder.rglob("*") if f.suffix.lower() in EXTENSIONS) if folder.is_dir() else []
+            if not files:
+                continue
+            index: dict[str, Path] = {}
+            for f in files:
+                relative = f.relative_to(folder)
+                number = _number(f.stem)
+                for key in (
+                    relative.as_posix(),
+                    relative.with_suffix("").as_posix(),
+                    f.name,
+                    f.stem,
+                    *([f"#{number}"] if number is not None else []),
+                ):
+                    index.setdefault(key, f)
+            return folder, index
+    return None, {}
+
+
+def _number(stem: str) -> int | None:
+    """The number in names such as 000012, mask_12: DTU pairs image/000012.png with mask/012.png."""
+    digits = re.findall(r"\d+", stem)
+    return int(digits[0]) if len(digits) == 1 and len(digits[0]) < 18 else None
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """(H, W) float32 in [0, 1]: the alpha channel where it varies, else the mean of the colour channels."""
+    data = np.clip(read_data(path), 0.0, 1.0)
+    if data.ndim == 2:
+        return data
+    if data.shape[2] in (2, 4):
+        alpha = data[..., -1]
+        if alpha.min() < 0.5 < alpha.max():
+            return alpha
+        data = data[..., :-1]
+    return data.mean(axis=-1)
+
+
+def border_share(mask: np.ndarray) -> float:
+    """Share of a (H, W) mask's border pixels that it covers."""
+    edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    return float((edge > 0.5).mean())
+
+
+def looks_inverted(mask: np.ndarray) -> bool:
+    """True when the mask covers the border all around and leaves out one compact region inside."""
+    if border_share(mask) < BORDER:
+        return False
+    outside = mask < 0.5
+    share = float(outside.mean())
+    if not 0.005 < share < 0.9:
+        return False
+    import cv2
+
+    _, _, stats, _ = cv2.connectedComponentsWithStats(outside.astype(np.uint8), connectivity=8)
+    return bool(stats[1:, cv2.CC_STAT_AREA].max() > 0.6 * outside.sum())
+
+
+def judge(masks: dict[str, np.ndarray], source: str) -> tuple[bool, list[str]]:
+    """Look at all masks of a capture (name -> (h, w) small mask).
+
+    Returns whether they are inverted, and the names of photos whose mask is empty. Raises UserError when the masks tell nothing
+    (all black, all white) or contradict each other. source: where they come from, for the message.
+    """
+    empty = [n for n, m in masks.items() if (m > 0.5).mean() < 1e-4]
+    full = [n for n, m in masks.items() if (m > 0.5).mean() > 0.999]
+    if len(empty) == len(masks):
+        raise UserError(
+            "all masks are black",
+            f"{source} marks no pixel of any photo as the object",
+            "write white on the object, or use --set masks=none",
+        )
+    if len(full) == len(masks):
+        raise UserError(
+            "all masks are white",
+            f"{source} marks every pixel of every photo as the object",
+            "write black off the object, or use --set masks=none",
+        )
+    rest = {n: m for n, m in masks.items() if n not in empty and n not in full}
+    inverted = [n for n, m in rest.items() if looks_inverted(m)]
+    if rest and len(inverted) >= 0.8 * len(rest):
+        return True, full  # of an inverted set, the all-white ones are the empty ones
+    if len(inverted) > max(1, 0.2 * len(rest)):
+        raise UserError(
+            f"{len(inverted)} of {len(masks)} masks look inverted, the others do not",
+            f"they are white at the border and black in the middle, for example that of {inverted[0]}",
+            f"invert them: white is the object ({source})",
+        )
+    if len(empty) > 0.5 * len(masks):
+        raise UserError(
+            f"{len(empty)} of {len(masks)} masks are black", f"for example that of {empty[0]}", f"write white on the object ({source})"
+        )
+    return False, empty
