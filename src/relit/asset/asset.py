@@ -154,7 +154,7 @@ def _write_json(path: Path, data: dict) -> None:
 
 
 def _swap(new: Path, folder: Path) -> None:
-    """Put `new` in the place of `folder`; a crash leaves one of the two."""
+    """Put `new` in the place of `folder`; the old one stands beside it under a hidden name until the new one is there."""
     if not folder.exists():
         os.replace(new, folder)
         return

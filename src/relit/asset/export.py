@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -42,7 +43,7 @@ def export_asset(folder_or_run: str | Path, format: str, out: str | Path) -> lis
         return [out]
     if format == "obj":
         return write_obj(out, asset.mesh, asset.material)
-    write_ply(out, asset.mesh, vertex_colors(asset.mesh, asset.material))
+    write_ply(out, replace(asset.mesh, uvs=None), vertex_colors(asset.mesh, asset.material))
     return [out]
 
 

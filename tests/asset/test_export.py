@@ -1,0 +1,73 @@
+"""Other forms of the asset say the same."""
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from relit.asset.asset import save_asset
+from relit.asset.export import export_asset
+from relit.asset.gltf import read_asset_file
+from relit.errors import UserError
+from relit.rendering.mitsuba_scene import build_scene, render
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, asset):
+    asset = replace(asset, material=replace(asset.material, specular=None))
+    return save_asset(tmp_path_factory.mktemp("run") / "asset", asset)
+
+
+def test_glb_and_obj_are_the_same_object(folder, tmp_path):
+    export_asset(folder, "glb", tmp_path / "out" / "a.glb")
+    files = export_asset(folder, "obj", tmp_path / "obj" / "a.obj")
+    assert {p.name for p in files} == {p.name for p in (tmp_path / "obj").iterdir()}
+    (m, t), (m2, t2) = read_asset_file(tmp_path / "out" / "a.glb"), read_asset_file(tmp_path / "obj" / "a.obj")
+    corners, corners2 = m.vertices[m.faces], m2.vertices[m2.faces]
+    assert np.allclose(corners, corners2, atol=1e-5)
+    assert np.allclose(m.uvs[m.faces], m2.uvs[m2.faces], atol=1e-5)
+    for key in ("base_color", "roughness", "metallic", "normal"):
+        assert np.abs(getattr(t, key) - getattr(t2, key)).max() < 0.01
+    assert t2.ior == pytest.approx(1.33)
+
+
+def test_ply_has_the_colours(folder, tmp_path):
+    import trimesh
+
+    export_asset(folder, "ply", tmp_path / "a.ply")
+    got = trimesh.load(tmp_path / "a.ply", process=False)
+    m, _ = read_asset_file(folder / "object.glb")
+    assert np.allclose(got.vertices, m.vertices)
+    assert np.array_equal(got.faces, m.faces)
+    red = np.asarray(got.visual.vertex_colors)[:, 0]
+    inside = (m.uvs[:, 0] > 0.05) & (m.uvs[:, 0] < 0.95)
+    assert np.corrcoef(red[inside], m.uvs[inside, 0])[0, 1] > 0.97  # the base colour's red grows with u
+    assert np.ptp(red) > 100
+
+
+def test_mitsuba_scene_renders_like_the_asset(folder, asset, tmp_path):
+    files = export_asset(folder, "mitsuba", tmp_path / "scene")
+    assert {"scene.xml", "object.ply", "environment.exr", "base_color.png"} <= {p.name for p in files}
+    scene = mi.load_file(str(tmp_path / "scene" / "scene.xml"))
+    picture = np.array(mi.render(scene, spp=64))
+    m, t = read_asset_file(folder / "object.glb")
+    ours = render(build_scene(m, t, asset.world_from_asset, asset.environment, bsdf="principled"), asset.cameras[0][1], spp=64)
+    inside = ours[..., 3] > 0.999
+    assert inside.sum() > 100
+    a, b = picture[..., :3][inside].clip(0, 1), ours[..., :3][inside].clip(0, 1)
+    assert -10 * np.log10(np.mean((a - b) ** 2)) > 25  # noise; a shift of one pixel costs more
+    assert np.abs(a.mean(0) - b.mean(0)).max() < 0.01
+
+
+def test_mistakes_get_an_answer(folder, tmp_path):
+    with pytest.raises(UserError, match="Did you mean 'glb'"):
+        export_asset(folder, "glbb", tmp_path / "a.glb")
+    with pytest.raises(UserError, match="must end in"):
+        export_asset(folder, "obj", tmp_path / "a.glb")
+    with pytest.raises(UserError, match="not an asset folder"):
+        export_asset(tmp_path, "glb", tmp_path / "a.glb")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "me.jpg").write_bytes(b"x")
+    with pytest.raises(UserError, match="something else"):
+        export_asset(folder, "mitsuba", tmp_path / "photos")
