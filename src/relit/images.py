@@ -137,7 +137,8 @@ def read_header(path: str | Path) -> Header:
         return Header(w, h)
     with _pil(path) as image:
         w, h = image.size
-        exif = image.getexif()
+        # Pillow decodes a whole PNG to look for EXIF behind the pixels; what stands before them is enough here
+        exif = image.getexif() if image.format != "PNG" or "exif" in image.info else PilImage.Exif()
         turned = exif.get(0x0112, 1) in (5, 6, 7, 8)
         w, h = (h, w) if turned else (w, h)
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info

@@ -12,7 +12,8 @@ from relit.errors import UserError
 from relit.scene import Camera, Sphere
 
 FILL = 0.88  # the object's radius as a share of the sphere's
-GRID = 48  # cells per side of the visual hull that is carved for the sphere
+GRID = 40  # cells per side of the visual hull that is carved for the sphere
+MOST_VIEWS = 40  # of the masks of a large capture, so many are carved with
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def robust_closest_point(origins: np.ndarray, directions: np.ndarray) -> np.ndar
 
 
 def sphere_from_rays(cameras: list[Camera]) -> Sphere:
-    """Sphere about the point nearest to all optical axes, as large as the shorter side of the median picture shows.
+    """Sphere about the point nearest to all optical axes, as large as the mean of the two sides of the median picture shows.
 
     Raises UserError when most cameras do not see that point.
     """
@@ -79,7 +80,7 @@ def sphere_from_rays(cameras: list[Camera]) -> Sphere:
             "check one pose by hand, or give the object sphere",
         )
     distance = np.linalg.norm(origins - centre, axis=1)[np.array(seen)]
-    half = np.array([np.arctan(0.5 * min(c.width / c.fx, c.height / c.fy)) for c, s in zip(cameras, seen, strict=True) if s])
+    half = np.array([np.arctan(0.5 * np.sqrt(c.width / c.fx * c.height / c.fy)) for c, s in zip(cameras, seen, strict=True) if s])
     radius = min(float(np.median(distance * np.sin(half))), 0.8 * float(distance.min()))
     return Sphere(centre, radius)
 
@@ -118,6 +119,8 @@ def sphere_from_masks(views: list[View]) -> Sphere:
     Raises UserError when the masks of different photos have no place in common.
     """
     views = [v for v in views if v.mask is not None and (v.mask > 0.5).any()]
+    if len(views) > MOST_VIEWS:
+        views = [views[i] for i in np.linspace(0, len(views) - 1, MOST_VIEWS).round().astype(int)]
     origins = np.array([v.camera.centre for v in views])
     rays, spread = zip(*(_mask_cone(v) for v in views), strict=True)
     centre = robust_closest_point(origins, np.array(rays))
@@ -160,6 +163,7 @@ def _carve(views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np
     axes = [low[i] + (np.arange(GRID) + 0.5) * cell[i] for i in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     shown, hit = np.zeros(len(points), int), np.zeros(len(points), int)
+    spare = 0.05 * len(views) if len(views) >= 20 else 0  # of many views, a few may have a hole in their mask
     for view, mask in zip(views, masks, strict=True):
         h, w = mask.shape
         c = view.camera.resized(w, h)
@@ -172,8 +176,9 @@ def _carve(views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np
         inside = front & (pixel >= 0).all(axis=1) & (pixel[:, 0] < w) & (pixel[:, 1] < h)
         shown += inside
         hit[inside] += mask[pixel[inside, 1], pixel[inside, 0]]
-    needed = np.where(shown >= 10, np.ceil(0.92 * shown), shown)  # of many views, a few may have a hole in their mask
-    return points[(shown >= max(2, len(views) / 2)) & (hit >= needed)], cell
+        alive = shown - hit <= spare
+        points, shown, hit = points[alive], shown[alive], hit[alive]
+    return points[shown >= max(2, len(views) / 2)], cell
 
 
 # ---------------------------------------------------------------- checks and up

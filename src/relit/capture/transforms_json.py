@@ -45,8 +45,9 @@ def read(path: Path, found: Path) -> Reading:
 def _complain(found: Path, frames: list[Frame], missing: list[str], notes: list[str]) -> None:
     present = sum(not f.held_out for f in frames)
     if present == 0 or len(missing) > present + 1:
+        example = f", for example '{missing[0]}'" if missing else ""
         raise UserError(
-            f"{len(missing)} of {len(missing) + present} photos in {found.name} are not there" + (f", for example '{missing[0]}'" if missing else ""),
+            f"{len(missing)} of {len(missing) + present} photos in {found.name} are not there{example}",
             "the images and the cameras do not belong together, or the images were renamed or not copied",
             f"put the images where file_path says, or correct it: {found}",
         )

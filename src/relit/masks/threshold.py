@@ -48,8 +48,8 @@ def find_backdrop(photos: list[np.ndarray]) -> Backdrop | None:
     values = np.concatenate(insides)
     if len(values) < 16:
         return None
-    # between the noise of the backdrop and the object; a cautious bound above, because shadowed parts of an object are dark as well
-    tolerance = float(np.clip(0.5 * _otsu(values), max(0.05, 1.2 * float(np.median(borders))), 0.19))
+    # near the backdrop's noise rather than half way to the object: shadowed parts of an object before a dark backdrop are dark as well
+    tolerance = float(np.clip(0.37 * _otsu(values), max(0.05, 1.2 * float(np.median(borders))), 0.15))
     shares = [float((_cleaned(_distance(c, k), tolerance) > 0.5).mean()) for c, k in zip(coded, colours, strict=True)]
     if np.mean([0.01 < s < 0.85 for s in shares]) < 0.8:
         return None
@@ -91,7 +91,7 @@ def _cleaned(distance: np.ndarray, tolerance: float) -> np.ndarray:
     """Threshold, close gaps, drop specks, fill small holes: shadows inside the object, not the opening of a handle."""
     h, w = distance.shape
     mask = (distance > tolerance).astype(np.uint8)
-    size = max(3, round(min(h, w) / 160)) | 1
+    size = max(3, round(min(h, w) / 60)) | 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc)
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
