@@ -37,7 +37,7 @@ with termination(), Run.open(sys.argv[1], {"seed": 0}) as r:
             for i in range(first, 200):
                 total += i
                 time.sleep(0.01)
-                s.step(i, total=total)
+                s.step(i + 1, total=total)
                 if s.checkpoint_due():
                     s.save("state", i=i + 1, total=total)
             s.save("state", i=200, total=total)
@@ -71,7 +71,7 @@ def test_a_stopped_job_goes_on_from_its_checkpoint(tmp_path, stop, code):
     assert job.returncode == 0
     assert int(load_arrays(folder / "stages/count/state.npz")["total"]) == sum(range(200))
     steps = [m["step"] for m in read_metrics(folder)]
-    assert steps == sorted(set(steps)) and steps[-1] == 199
+    assert steps == sorted(set(steps)) and steps[-1] == 200
 
 
 def test_a_folder_is_held_by_one_process_and_freed_by_its_death(tmp_path):
@@ -143,14 +143,14 @@ def test_stage_records_time_memory_and_losses(tmp_path):
     calls = []
     with Run.open(tmp_path, CONFIG) as run:
         with run.stage("fit", steps=1000, title="volume pass") as stage:
-            for i in range(1000):
-                stage.step(i, loss=lambda i=i: calls.append(i) or 1.0 / (i + 1), rate=0.1)
+            for i in range(1, 1001):
+                stage.step(i, loss=lambda i=i: calls.append(i) or 1.0 / i, rate=0.1)
         assert run.done("fit") and not run.done("other")
         (record,) = run.stages()
         assert record["title"] == "volume pass" and record["seconds"] < 10 and record["peak_memory"] > 1e6
         assert len(calls) < 20  # callables are evaluated only when a line is written
         last = run.metrics()[-1]
-        assert last["stage"] == "fit" and last["step"] == 999 and last["loss"] == pytest.approx(0.001)
+        assert last["stage"] == "fit" and last["step"] == 1000 and last["loss"] == pytest.approx(0.001)
 
 
 def test_a_failing_stage_is_not_done(tmp_path):

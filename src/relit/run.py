@@ -144,16 +144,16 @@ class Stage:
         return self.earlier + time.monotonic() - self._begun
 
     def step(self, i: int, /, **losses: float | Callable[[], float]) -> None:
-        """Tell that step `i` (from 0) is over. A loss given as a callable is evaluated only when a line is written."""
+        """Tell that `i` steps (1 ... `steps`) are over. A loss given as a callable is evaluated only when a line is written."""
         now = time.monotonic()
         values: dict[str, float] = {}
-        if losses and (now - self._written >= METRICS_SECONDS or i + 1 == self.steps):
+        if losses and (now - self._written >= METRICS_SECONDS or i == self.steps):
             values = {key: float(v() if callable(v) else v) for key, v in losses.items()}
             self._written = now
             record = {"stage": self.name, "step": i, "seconds": round(self.seconds, 3), **{k: _finite(v) for k, v in values.items()}}
             with (self.run.folder / "metrics.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record) + "\n")
-        self._progress.update(i + 1, values)
+        self._progress.update(i, values)
 
     def checkpoint_due(self) -> bool:
         """True when the last checkpoint (or the beginning) is 20 s ago; up to 60 s where writing one takes long."""
