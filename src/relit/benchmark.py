@@ -126,7 +126,7 @@ def synthesize_item(suite: Suite, item: Item, data: Path, cache: Path, say: Call
 
 def reconstruct_command(capture: Path, out: Path, quality: str, device: str, seed: int, settings: Sequence[str] = ()) -> list[str]:
     """The command line that is timed."""
-    command = [sys.executable, "-m", "relit.cli", "reconstruct", str(capture), "-o", str(out), "--capture", "multiview"]
+    command = [sys.executable, "-m", "relit", "reconstruct", str(capture), "-o", str(out), "--capture", "multiview"]
     command += ["--quality", quality, "--device", device, "--seed", str(seed)]
     for s in settings:
         command += ["--set", s]
@@ -214,6 +214,10 @@ def run_suite(
             result["runs"][variant][name] = {**entry, "run": run.name, "capture": capture.name}
             result["means"][variant] = means(result["runs"][variant])
             _save(result, folder, json_file)
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else 160).print(table(result))
+    say(f"results: {folder / 'results.json'}, {folder / 'results.md'}")
     return result
 
 
