@@ -6,7 +6,7 @@ serves every view of a scene.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -17,6 +17,7 @@ from relit.conventions import move_points, move_pose, scale_of, similarity
 from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals, vertex_tangents
 from relit.rendering import bsdf as relit_bsdf
+from relit.rendering.path import SmoothOrigins, trace
 from relit.scene import Camera, Material, Mesh
 
 RAYS_PER_PASS = 1 << 21  # bounds the memory of a pass: about 50 bytes a ray
@@ -28,13 +29,13 @@ class Scene:
 
     mi_scene: the Mitsuba scene, moved and scaled (not turned) so that the object fills the unit ball: Mitsuba's ray offsets have a
     fixed size. textures: Mitsuba textures by name (base_color, roughness, metallic, specular, normalmap; the last two may be None).
-    integrators: Mitsuba integrators by maximal depth, made on demand. unit_from_world: (4, 4), scale and translation.
+    unit_from_world: (4, 4), scale and translation. origins: where rays leave from, None to leave that to Mitsuba's own `path`.
     """
 
     mi_scene: Any
     textures: dict
-    integrators: dict
     unit_from_world: np.ndarray
+    origins: SmoothOrigins | None
 
 
 def _texture(array, *, color=False):
@@ -70,23 +71,27 @@ def _unit_from_world(mesh: Mesh, world_from_asset) -> np.ndarray:
     return similarity(np.eye(3), -centre / radius, 1 / radius)
 
 
-def _mesh(mesh: Mesh, unit_from_asset, bsdf, with_tangents: bool):
+def _moved(mesh: Mesh, unit_from_asset) -> Mesh:
+    """The mesh, with smooth normals where it has none, in the unit frame."""
     m = np.asarray(unit_from_asset, np.float64)
-    rotation = m[:3, :3] / scale_of(m)
-    normals = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64) @ rotation.T
+    normals = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64) @ (m[:3, :3] / scale_of(m)).T
+    return replace(mesh, vertices=move_points(m, mesh.vertices).astype(np.float32), normals=normals.astype(np.float32))
+
+
+def _shape(mesh: Mesh, bsdf, with_tangents: bool):
     props = mi.Properties()
     props["mesh_bsdf"] = bsdf
     out = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), props, True, mesh.uvs is not None)
     p = mi.traverse(out)
-    p["vertex_positions"] = mi.Float((np.asarray(mesh.vertices, np.float64) @ m[:3, :3].T + m[:3, 3]).astype(np.float32).ravel())
-    p["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
+    p["vertex_positions"] = mi.Float(mesh.vertices.ravel())
+    p["vertex_normals"] = mi.Float(mesh.normals.ravel())
     if mesh.uvs is not None:
         p["vertex_texcoords"] = mi.Float(np.asarray(mesh.uvs, np.float32).ravel())
     p["faces"] = mi.UInt32(np.asarray(mesh.faces, np.uint32).ravel())
     p.update()
     if with_tangents:
         t = vertex_tangents(mesh)
-        out.add_attribute("vertex_tangent", 3, (t[:, :3].astype(np.float64) @ rotation.T).astype(np.float32).ravel())
+        out.add_attribute("vertex_tangent", 3, np.ascontiguousarray(t[:, :3]).ravel())
         out.add_attribute("vertex_handedness", 1, np.ascontiguousarray(t[:, 3]))
     return out
 
@@ -95,7 +100,8 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
     """A Mitsuba scene in the world frame.
 
     world_from_asset: (4, 4) similarity or None for the identity. environment: (H, W, 3) lat-long radiance in the world frame, or None for
-    darkness. bsdf: 'relit' (materials.brdf, what fits use) or 'principled' (Mitsuba's own, for ground truth that Relit did not write).
+    darkness. bsdf: 'relit' (materials.brdf and rendering.path, what fits use) or 'principled' (Mitsuba's own BSDF and path tracer, for
+    ground truth that Relit did not write).
     """
     if bsdf not in ("relit", "principled"):
         raise UserError(f"unknown bsdf '{bsdf}'", fix="choose relit or principled", code=2)
@@ -119,11 +125,12 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
             d = {"type": "normalmap", "normalmap": t["normalmap"], "bsdf": d}
         d = {"type": "twosided", "bsdf": d}
     unit_from_world = _unit_from_world(mesh, world_from_asset)
-    shape = _mesh(mesh, unit_from_world @ world_from_asset, mi.load_dict(d), t["normalmap"] is not None)
+    unit = _moved(mesh, unit_from_world @ world_from_asset)
+    shape = _shape(unit, mi.load_dict(d), t["normalmap"] is not None)
     scene = {"type": "scene", "object": shape}
     if environment is not None:
         scene["environment"] = {"type": "envmap", "bitmap": mi.Bitmap(environment_bitmap(environment))}
-    return Scene(mi.load_dict(scene), t, {}, unit_from_world)
+    return Scene(mi.load_dict(scene), t, unit_from_world, SmoothOrigins(unit) if bsdf == "relit" else None)
 
 
 def _camera_rays(scene: Scene, camera: Camera, sampler, count: int):
@@ -161,14 +168,17 @@ def render(scene: Scene, camera: Camera, *, spp: int, seed: int = 0, max_depth: 
 
     max_depth: longest path in edges (2 = direct light only, 6 = four inter-reflections). Not differentiable.
     """
-    if max_depth not in scene.integrators:
-        scene.integrators[max_depth] = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True})
-    integrator, pixels = scene.integrators[max_depth], camera.width * camera.height
+    pixels, depth = camera.width * camera.height, dr.opaque(mi.UInt32, max_depth)
+    if scene.origins is None:
+        path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True})
     total = np.zeros((pixels, 4))
     with dr.suspend_grad():
         for sampler, n in _passes(camera, spp, seed):
             ray, _ = _camera_rays(scene, camera, sampler, n * pixels)
-            color, hit, _ = integrator.sample(scene.mi_scene, sampler, ray)
+            if scene.origins is None:
+                color, hit, _ = path.sample(scene.mi_scene, sampler, ray)
+            else:
+                color, hit = trace(scene.mi_scene, scene.origins, sampler, mi.Ray3f(ray), depth)
             rgba = [*color, dr.select(hit, mi.Float(1), 0)]
             dr.eval(rgba)
             for c in range(4):
