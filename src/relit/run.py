@@ -29,7 +29,7 @@ from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_secon
 CHECKPOINT_SECONDS = 20.0  # a checkpoint is due this long after the last one, later if writing one is slow
 CHECKPOINT_LONGEST = 60.0  # ... but never later than this
 METRICS_SECONDS = 0.5  # between two lines of metrics.jsonl
-OWNED = ("config.toml", "inputs.json", "log.txt", "metrics.jsonl", "stages", "previews", "asset", "report.html")
+OWNED = ("config.toml", "inputs.json", "evaluation.json", "log.txt", "metrics.jsonl", "stages", "previews", "asset", "report.html")
 
 
 class Terminated(BaseException):
@@ -117,8 +117,7 @@ class Run:
 
     def stages(self) -> list[dict]:
         """The finished stages in the order in which they ended: name, title, seconds, peak_memory (bytes)."""
-        records = [read_json(p) for p in (self.folder / "stages").glob("*/DONE")]
-        return sorted((r for r in records if r), key=lambda r: r["ended"])
+        return read_stages(self.folder)
 
     def metrics(self) -> list[dict]:
         """The lines of metrics.jsonl; steps that were repeated after a resume appear once, a torn last line is left out."""
@@ -192,6 +191,12 @@ class Stage:
         folder = self.run.folder / "previews"
         folder.mkdir(exist_ok=True)
         write_srgb(folder / f"{self.name}_{name}.jpg", linear_rgb)
+
+
+def read_stages(folder: Path) -> list[dict]:
+    """The records of RUN's finished stages, see `Run.stages`."""
+    records = [read_json(p) for p in (Path(folder) / "stages").glob("*/DONE")]
+    return sorted((r for r in records if r), key=lambda r: r["ended"])
 
 
 def read_metrics(folder: Path) -> list[dict]:

@@ -107,7 +107,7 @@ def _job(parser: Parser, quality: str | None) -> None:
 def _opening(parser: Parser) -> None:
     """Flags that say how the input is to be read."""
     add = parser.more.add_argument
-    add("--masks", default=None, metavar="HOW", help="auto (default), or how to find masks: see docs/formats.md")
+    add("--masks", default=None, metavar="HOW", help="auto (default), none, alpha, files, threshold, grabcut, segment")
     add("--sphere", type=_sphere, default=None, metavar="X,Y,Z,R", help="ball that holds the object, in the frame and unit of the cameras")
     add("--max-side", type=int, default=None, metavar="PIXELS", help="shrink photos whose longer side is longer")
 
@@ -216,9 +216,9 @@ def _export(args) -> None:
     if kind is None:
         raise UserError("the form cannot be told from the ending of -o", fix="add --format glb, obj, ply or mitsuba", code=EXIT_USAGE)
     _free(args.out, args.overwrite)
-    from relit.asset.export import export
+    from relit.asset.export import export_asset
 
-    export(args.run, kind, args.out)
+    export_asset(args.run, kind, args.out)
     print(args.out)
 
 

@@ -1,0 +1,289 @@
+"""report.html: one file that shows a run. Pictures are data URIs, curves are inline SVG; nothing is fetched and no script runs.
+
+Reads the run folder only: asset, metrics.jsonl, stage records, evaluation.json where `relit evaluate` or the demo wrote one.
+"""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from relit.asset.asset import load_asset
+from relit.cameras.se3 import look_at
+from relit.capture.procedural import evening, studio
+from relit.conventions import linear_from_srgb, move_points
+from relit.evaluate.curves import bars, camera_plot, curve
+from relit.evaluate.metrics import encode, psnr
+from relit.files import parse_toml, read_json, write_text
+from relit.images import encode_jpeg
+from relit.log import readable_bytes, readable_seconds
+from relit.rendering.mitsuba_scene import build_scene, render, render_channels
+from relit.run import read_metrics, read_stages
+from relit.scene import Asset, Camera, Capture
+
+SIDE = 240  # pixels, longer side of a picture
+VIEWS = 4  # training photos that are compared
+HELD_OUT = 2  # photos that the fit has not seen
+STILLS = 12  # of the turntable
+SPP = 24  # samples a pixel; the report is for looking, figures come from `relit evaluate`
+BACKDROP = 0.18  # linear grey behind the object
+
+STYLE = f"""
+body{{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:1180px;padding:0 1em;color:#222;background:#fafafa}}
+h1{{font-size:1.6em;margin-bottom:.1em}}h2{{font-size:1.15em;margin:2em 0 .5em;border-bottom:1px solid #ccc}}
+.row{{display:flex;flex-wrap:wrap;gap:10px;margin-bottom:10px}}figure{{margin:0}}figcaption{{font-size:12px;color:#555}}
+img{{display:block;border-radius:3px}}svg{{background:#fff;border:1px solid #ddd;border-radius:3px}}
+table{{border-collapse:collapse;font-size:14px}}td,th{{padding:3px 12px 3px 0;text-align:left;vertical-align:top}}
+td.n{{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}}code{{background:#eee;padding:1px 4px}}
+.turn{{overflow:hidden;border-radius:3px}}.turn img{{max-width:none;animation:turn 4s steps({STILLS}) infinite}}
+@keyframes turn{{to{{transform:translateX(-100%)}}}}
+"""
+
+
+def write_report(run: str | Path, capture: Capture | None = None) -> Path:
+    """Write RUN/report.html. capture: the photos to compare with (without it that part is left out). Call `use_device` first."""
+    run = Path(run)
+    asset = load_asset(run)
+    # as the asset stands in its GLB: what is shown is what is shipped
+    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
+    parts = [
+        _head(run, asset),
+        _section("Photos and renders under the recovered light", _comparison(asset, scene, capture)),
+        _section("Material and shape", _channels(asset, scene)),
+        _section("Light", _light(asset)),
+        _section("Another light", _turntables(asset)),
+        _section("Figures against the truth", _figures(run)),
+        _section("Cameras", camera_plot(asset)),
+        _section("Losses", _losses(run)),
+        _section("Time and memory", _costs(run)),
+        _section("Textures", _textures(asset)),
+        _section("Notes", _notes(run, asset)),
+        _section("Files", _files(run)),
+    ]
+    title = escape(_title(run))
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+    write_text(run / "report.html", head + "".join(parts) + "</html>\n")
+    return run / "report.html"
+
+
+# ---------------------------------------------------------------- sections
+
+
+def _head(run: Path, asset: Asset) -> str:
+    meta, config = asset.meta, _config(run)
+    seconds = sum(s["seconds"] for s in read_stages(run))
+    facts = [
+        f"{len(asset.cameras)} cameras",
+        ", ".join(f"{key} {value}" for key, value in {**meta, **config}.items() if key in ("quality", "seed", "device")),
+        f"{len(asset.mesh.faces):,} triangles",
+        "textures {1}x{0}".format(*asset.material.base_color.shape[:2]),
+        readable_seconds(seconds),
+    ]
+    return f"<h1>{escape(_title(run))}</h1><p>{' &middot; '.join(escape(f) for f in facts)}</p>"
+
+
+def _comparison(asset: Asset, scene, capture: Capture | None) -> str:
+    photos = {} if capture is None else {p.name: p for p in (*capture.photos, *capture.held_out)}
+    rows = []
+    held_out = [] if capture is None else [(p.name, p.camera) for p in capture.held_out if p.camera is not None]
+    chosen = _spread([c for c in asset.cameras if c[0] in photos], VIEWS) + _spread(held_out, HELD_OUT)
+    for name, camera in chosen:
+        pixels = photos[name].load()
+        small = _fitted(camera)
+        photo = _resized(pixels.rgb, small)
+        picture = render(scene, small, spp=SPP)
+        seen = picture[..., 3] > 0.5
+        if pixels.mask is not None:
+            photo = photo * _resized(pixels.mask[..., None], small)
+        quality = psnr(encode(picture[..., :3]), encode(photo), seen)
+        name += " (held out)" if any(name == n for n, _ in held_out) else ""
+        caption = f"{name}: {quality:.1f} dB where the object is drawn" if seen.any() else f"{name}: the object is not in view"
+        pair = np.concatenate([photo, picture[..., :3], _difference(photo, picture)], axis=1)
+        rows.append(_figure(pair, caption + ". Photo, render, difference x 4"))
+    return "".join(f"<div class=row>{r}</div>" for r in rows)
+
+
+def _difference(photo: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    seen = picture[..., 3:] > 0.5
+    return linear_from_srgb(np.clip(4 * np.abs(encode(photo) - encode(picture[..., :3])), 0, 1)) * seen
+
+
+def _channels(asset: Asset, scene) -> str:
+    rows = []
+    for name, camera in _spread(asset.cameras, 2):
+        small = _fitted(camera)
+        c = render_channels(scene, small, spp=16)
+        a = c["alpha"][..., None]
+        shown = {
+            "base colour": c["albedo"],
+            "roughness": linear_from_srgb(np.repeat(c["roughness"][..., None], 3, 2)),
+            "metallic": linear_from_srgb(np.repeat(c["metallic"][..., None], 3, 2)),
+            "normal (world)": linear_from_srgb(np.clip(0.5 * c["normal"] + 0.5, 0, 1)),
+        }
+        cells = "".join(_figure(v * a + BACKDROP * (1 - a), k if k != "base colour" else f"{k}, {name}") for k, v in shown.items())
+        rows.append(f"<div class=row>{cells}</div>")
+    return "".join(rows)
+
+
+def _light(asset: Asset) -> str:
+    if asset.environment is None:
+        return "<p>The asset holds no environment map.</p>"
+    e = asset.environment
+    level = float(np.mean(e)) or 1.0
+    shown = [(0.3 / level, "mean radiance drawn as .3"), (0.02 / level, "15 times darker: what is bright")]
+    cells = "".join(_figure(_scaled(e * k, 480), text) for k, text in shown)
+    peak = f"Mean {level:.3g}, largest {float(e.max()):.3g}, in units of the photos' linear pixels. Middle of the picture: +Z, top: +Y."
+    return f"<div class=row>{cells}</div><p>{peak}</p>"
+
+
+def _turntables(asset: Asset) -> str:
+    cameras = orbit(asset, STILLS, SIDE)
+    cells = []
+    lights = {"a studio of formulas": studio(64), "an evening of formulas": evening(64)}
+    for name, light in lights.items():
+        scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, light)
+        stills = [render(scene, c, spp=SPP, max_depth=4) for c in cameras]
+        covered = np.concatenate([s[s[..., 3] > 0.5][:, :3].ravel() for s in stills])
+        k = 0.9 / max(float(np.percentile(covered, 99)), 1e-6) if covered.size else 1.0
+        strip = np.concatenate([s[..., :3] * k + BACKDROP * (1 - s[..., 3:]) for s in stills], axis=1)
+        picture = f'<img alt="" src="{_uri(strip)}">'
+        frame = f'<div class=turn style="width:{SIDE}px;height:{SIDE}px">{picture}</div>'
+        cells.append(f"<figure>{frame}<figcaption>{escape(name)}</figcaption></figure>")
+        cells.append(_figure(_scaled(np.concatenate([strip[:, i * SIDE : (i + 1) * SIDE] for i in (0, 4, 8)], 1), 3 * 200), "stills of it"))
+    return f"<div class=row>{''.join(cells)}</div>"
+
+
+def _figures(run: Path) -> str:
+    found = read_json(run / "evaluation.json")
+    if not found:
+        return "<p>No truth was given. <code>relit evaluate RUN --truth DIR</code> measures against a synthetic capture.</p>"
+    rows = [(name, f"{e['value']:.4g}", e["unit"], e["definition"]) for name, e in found["metrics"].items()]
+    return _table(("figure", "value", "unit", "definition"), rows)
+
+
+def _losses(run: Path) -> str:
+    stages: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for record in read_metrics(run):
+        for key, value in record.items():
+            if key not in ("stage", "step", "seconds") and isinstance(value, (int, float)):
+                stages.setdefault(record["stage"], {}).setdefault(key, []).append((record["step"], value))
+    plots = [curve(f"{stage}: {name}", points) for stage, named in stages.items() for name, points in named.items() if len(points) > 1]
+    return f"<div class=row>{''.join(plots)}</div>" if plots else "<p>No losses were recorded.</p>"
+
+
+def _costs(run: Path) -> str:
+    stages = read_stages(run)
+    rows = [(s["title"], readable_seconds(s["seconds"]), readable_bytes(s["peak_memory"])) for s in stages]
+    table = _table(("stage", "time", "peak memory"), rows)
+    return f"<div class=row>{table}{bars([(s['title'], s['seconds']) for s in stages])}</div>"
+
+
+def _textures(asset: Asset) -> str:
+    m = asset.material
+    shown = {
+        "base colour": m.base_color,
+        "roughness": linear_from_srgb(np.repeat(np.clip(m.roughness, 0, 1)[..., None], 3, 2)),
+        "metallic": linear_from_srgb(np.repeat(np.clip(m.metallic, 0, 1)[..., None], 3, 2)),
+    }
+    if m.normal is not None:
+        shown["normal (tangent)"] = linear_from_srgb(np.clip(0.5 * np.asarray(m.normal) + 0.5, 0, 1))
+    return f"<div class=row>{''.join(_figure(_scaled(v, SIDE), k) for k, v in shown.items())}</div>"
+
+
+def _notes(run: Path, asset: Asset) -> str:
+    notes = read_json(run / "stages" / "asset" / "notes.json") or []
+    lines = [str(n) for n in notes] or ["The reader had nothing to remark."]
+    versions = asset.meta.get("versions")
+    if isinstance(versions, dict):
+        lines.append("made with " + ", ".join(f"{k} {v}" for k, v in versions.items()))
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def _files(run: Path) -> str:
+    files = sorted(p for p in (run / "asset").rglob("*") if p.is_file())
+    return _table(("file", "size"), [(str(p.relative_to(run)), readable_bytes(p.stat().st_size)) for p in files])
+
+
+# ---------------------------------------------------------------- pieces
+
+
+def orbit(asset: Asset, count: int, side: int) -> list[Camera]:
+    """`count` square cameras of `side` pixels around the asset, 20 degrees above its equator, in the world frame."""
+    low, high = asset.mesh.vertices.min(0), asset.mesh.vertices.max(0)
+    centre = 0.5 * (low + high)
+    radius = float(np.linalg.norm(asset.mesh.vertices - centre, axis=1).max())
+    place = np.asarray(asset.world_from_asset, np.float64)
+    up = place[:3, :3] @ np.array([0.0, 1.0, 0.0])
+    distance, focal = 3.4 * radius, side * 1.5  # the ball of the object fills 92 % of the frame
+    out = []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        towards = np.array([np.sin(angle) * np.cos(0.35), np.sin(0.35), np.cos(angle) * np.cos(0.35)])
+        eye, target = move_points(place, centre + distance * towards), move_points(place, centre)
+        out.append(Camera(side, side, focal, focal, side / 2, side / 2, look_at(eye, target, up)))
+    return out
+
+
+def _spread(items, count: int) -> list:
+    """At most `count` items, evenly spread."""
+    items = list(items)
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))] if items else []
+
+
+def _fitted(camera: Camera) -> Camera:
+    k = SIDE / max(camera.width, camera.height)
+    return camera if k >= 1 else camera.resized(max(1, round(camera.width * k)), max(1, round(camera.height * k)))
+
+
+def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W, C) linear picture at the size of `camera`, by the mean over areas."""
+    import cv2
+
+    out = cv2.resize(np.ascontiguousarray(image, dtype=np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return out[..., None] if out.ndim == 2 else out
+
+
+def _scaled(image: np.ndarray, width: int) -> np.ndarray:
+    import cv2
+
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    how = cv2.INTER_AREA if width <= image.shape[1] else cv2.INTER_LINEAR
+    return cv2.resize(np.ascontiguousarray(image, dtype=np.float32), (width, height), interpolation=how)
+
+
+def _uri(linear: np.ndarray) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(encode_jpeg(np.nan_to_num(linear))).decode("ascii")
+
+
+def _figure(linear: np.ndarray, caption: str) -> str:
+    h, w = linear.shape[:2]
+    text = escape(caption)
+    picture = f'<img alt="{text}" width={w} height={h} src="{_uri(linear)}">'
+    return f'<figure>{picture}<figcaption style="max-width:{w}px">{text}</figcaption></figure>'
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """The second and third columns hold numbers."""
+    lines = ["".join(f"<th>{escape(h)}</th>" for h in head)]
+    lines += ["".join(f"<td{' class=n' if i in (1, 2) else ''}>{escape(c)}</td>" for i, c in enumerate(row)) for row in rows]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+
+
+def _section(title: str, body: str) -> str:
+    return f"<h2>{escape(title)}</h2>{body}" if body else ""
+
+
+def _config(run: Path) -> dict:
+    try:
+        return parse_toml((run / "config.toml").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _title(run: Path) -> str:
+    return f"Relit: {_config(run).get('input', run.resolve().name)}"
+
+
+__all__ = ["orbit", "write_report"]
