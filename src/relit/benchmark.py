@@ -133,6 +133,19 @@ def reconstruct_command(capture: Path, out: Path, quality: str, device: str, see
     return command
 
 
+# A process that is started from a large one is charged with that one's memory up to its exec (Linux keeps it in ru_maxrss), and this
+# one has rendered before. So a small one starts the command and reads its peak.
+LAUNCHER = """
+import json, os, subprocess, sys, time
+start = time.perf_counter()
+process = subprocess.Popen(sys.argv[2:], stdin=subprocess.DEVNULL)
+_, status, usage = os.wait4(process.pid, 0)
+seconds = time.perf_counter() - start
+with open(sys.argv[1], "w") as file:
+    json.dump([seconds, os.waitstatus_to_exitcode(status), usage.ru_maxrss], file)
+"""
+
+
 def timed(command: Sequence[str], log: Path) -> tuple[float, float]:
     """Run a command with its output in `log`; (seconds, peak memory in GB).
 
@@ -140,21 +153,19 @@ def timed(command: Sequence[str], log: Path) -> tuple[float, float]:
     waited for.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
+    usage = log.with_suffix(".usage.json")
+    usage.unlink(missing_ok=True)
     with log.open("wb") as file:
-        process = subprocess.Popen(list(command), stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
-        try:
-            _, status, usage = os.wait4(process.pid, 0)
-        except BaseException:
-            process.kill()
-            raise
-    seconds = time.perf_counter() - start
-    process.returncode = code = os.waitstatus_to_exitcode(status)
+        launch = [sys.executable, "-S", "-E", "-c", LAUNCHER, str(usage), *command]
+        subprocess.run(launch, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, check=False)
+    if not usage.exists():
+        raise UserError("the command was stopped before it could be measured", fix=f"its output: {log}", code=EXIT_FAILED)
+    seconds, code, peak = json.loads(usage.read_text())
     if code != 0:
         tail = log.read_text(errors="replace").strip().splitlines()[-12:]
         raise UserError(f"the command ended with code {code}", "\n".join(tail), f"its whole output: {log}", code=EXIT_FAILED)
     unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss: bytes there, KiB on Linux
-    return seconds, usage.ru_maxrss * unit / 1e9
+    return seconds, peak * unit / 1e9
 
 
 def run_suite(

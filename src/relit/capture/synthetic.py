@@ -101,6 +101,8 @@ def synthesize_multiview(
     test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="test/t_")
     truth = out / "truth"
     _write_mesh(truth / "mesh.ply", mesh, world_from_asset)
+    _write_transforms(out / "transforms_train.json", train, resolution)
+    _write_transforms(out / "transforms_test.json", test, resolution)
 
     def lit(file: Path):
         """Scene under a light whose exposure fits the object, and that light."""
@@ -128,8 +130,6 @@ def synthesize_multiview(
                 write_linear(target, radiance(scene, camera, test_spp, max_depth, seed * 1_000_003 + 600_000 + 1000 * j + i))
             _report(say, f"test view under {file.stem}", i, test_views)
 
-    _write_transforms(out / "transforms_train.json", train, resolution)
-    _write_transforms(out / "transforms_test.json", test, resolution)
     _write_json(
         truth / "truth.json",
         {

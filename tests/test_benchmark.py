@@ -1,0 +1,117 @@
+"""The benchmark's own work: caching, timing, means, bars, results. The reconstruction is stood in for by a copy of the true asset."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from relit import benchmark
+from relit.capture import synthetic
+from relit.errors import EXIT_FAILED, UserError
+from relit.images import write_linear
+from relit.scene import Asset, Material, Mesh
+
+
+def test_a_command_is_timed_and_its_memory_measured(tmp_path):
+    script = "import time; a = bytearray(200_000_000); time.sleep(0.3); print('said')"
+    seconds, memory = benchmark.timed([sys.executable, "-c", script], tmp_path / "logs" / "x.txt")
+    assert 0.3 < seconds < 20 and 0.2 < memory < 0.4
+    assert (tmp_path / "logs" / "x.txt").read_text() == "said\n"
+    small = benchmark.timed([sys.executable, "-c", "pass"], tmp_path / "y.txt")[1]
+    assert small < 0.1  # a later command does not inherit the peak of an earlier one
+
+
+def test_a_failed_command_shows_the_end_of_its_output(tmp_path):
+    with pytest.raises(UserError) as error:
+        benchmark.timed([sys.executable, "-c", "print('the reason'); raise SystemExit(4)"], tmp_path / "log.txt")
+    assert error.value.code == EXIT_FAILED and "the reason" in error.value.why and "code 4" in error.value.what
+
+
+def test_bars_are_told_by_how_much_they_are_missed():
+    assert benchmark.verdict("novel_psnr", 32.5, "standard") == "met"
+    assert benchmark.verdict("novel_psnr", 30.5, "standard") == "missed by 1.5"
+    assert benchmark.verdict("chamfer_percent", 0.75, "standard") == "missed by 0.25"
+    assert benchmark.verdict("seconds", 100, "standard") == "met" and benchmark.verdict("seconds", 100, "draft") == "missed by 10"
+    assert benchmark.verdict("novel_psnr", 10, "draft") == "" and benchmark.verdict("novel_ssim", 0.1, "standard") == ""
+
+
+def test_means_are_over_figures_that_every_object_has():
+    runs = {"a": {"metrics": {"x": {"value": 1.0}, "y": {"value": 5.0}}}, "b": {"metrics": {"x": {"value": 3.0}}}}
+    assert benchmark.means(runs) == {"x": 2.0}
+
+
+def test_wrong_names_are_answered(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="multiview"):
+        benchmark.run_suite("multivew")
+    with pytest.raises(UserError, match="spot"):
+        benchmark.run_suite("multiview", objects=["spto"])
+    with pytest.raises(UserError, match="ablation"):
+        benchmark.run_suite("multiview", ablate=["nonsense"])
+    with pytest.raises(UserError, match="assets are not there"):
+        benchmark.data_folder(tmp_path)
+    monkeypatch.setenv("RELIT_CACHE", str(tmp_path / "c"))
+    assert benchmark.cache_folder() == tmp_path / "c" and benchmark.cache_folder(tmp_path) == tmp_path
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """A suite of one grey ball, and a true asset that stands in for its reconstruction."""
+    from relit.asset.asset import save_asset
+    from relit.asset.gltf import write_glb
+
+    data, ball = tmp_path / "data", trimesh.creation.icosphere(2)
+    mesh = Mesh(
+        ball.vertices.astype(np.float32),
+        ball.faces.astype(np.int32),
+        ball.vertices.astype(np.float32),
+        np.full((len(ball.vertices), 2), 0.5, np.float32),
+    )
+    material = Material(np.full((4, 4, 3), 0.5, np.float32), np.full((4, 4), 0.6, np.float32), np.zeros((4, 4), np.float32))
+    (data / "assets").mkdir(parents=True)
+    write_glb(data / "assets" / "ball.glb", mesh, material)
+    for name, value in (("a", 2.0), ("b", 0.5)):
+        write_linear(data / "envmaps" / f"{name}.exr", np.full((8, 16, 3), value, np.float32) * [1.0, 0.9, 0.8])
+    item = benchmark.Item("ball", "assets/ball.glb", "envmaps/a.exr")
+    suite = benchmark.Suite((item,), ("envmaps/b.exr",), views=3, test_views=1, resolution=24, spp=4, test_spp=16)
+    monkeypatch.setitem(benchmark.SUITES, "tiny", suite)
+    scale = synthetic.RADIUS
+    save_asset(tmp_path / "ready", Asset(mesh, material, np.diag([scale, scale, scale, 1.0]), np.ones((8, 16, 3), np.float32)))
+    return tmp_path, data
+
+
+def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
+    folder, data = tiny
+    commands = []
+
+    def stand_in(capture, out, quality, device, seed, settings=()):
+        commands.append((capture, quality, settings))
+        return [sys.executable, "-c", f"import shutil; shutil.copytree({str(folder / 'ready')!r}, {str(out)!r})"]
+
+    monkeypatch.setattr(benchmark, "reconstruct_command", stand_in)
+    options = dict(assets=data, cache=folder / "cache", device="cpu", spp=16, ablate=["max_depth=2"])
+    result = benchmark.run_suite("tiny", out=folder / "out", json_file=folder / "r" / "x.json", **options)
+    assert [c[2] for c in commands] == [(), ("max_depth=2",)]
+    plain = result["runs"]["plain"]["ball"]["metrics"]
+    assert plain["relit_psnr"]["value"] > 25 and plain["seconds"]["value"] > 0 and plain["peak_memory"]["value"] > 0
+    assert result["means"]["plain"]["relit_psnr"] == plain["relit_psnr"]["value"]
+    assert json.loads((folder / "r" / "x.json").read_text()) == json.loads((folder / "out" / "results.json").read_text()) == result
+    text = (folder / "out" / "results.md").read_text()
+    assert "### max_depth=2" in text and "| relit_psnr | dB |" in text and ">= 31" in text
+    assert "relit_psnr" in capsys.readouterr().out
+
+    captures = list((folder / "cache" / "captures").iterdir())
+    stamp = (captures[0] / "truth" / "truth.json").stat().st_mtime_ns
+    with pytest.raises(UserError, match="already"):  # a run that is there would be resumed, and its time would mean nothing
+        benchmark.run_suite("tiny", out=folder / "out", **options)
+    assert list((folder / "cache" / "captures").iterdir()) == captures
+    assert (captures[0] / "truth" / "truth.json").stat().st_mtime_ns == stamp
+    shutil.rmtree(folder / "cache")
+
+
+def test_the_command_is_the_one_a_user_would_give(tmp_path):
+    command = benchmark.reconstruct_command(tmp_path / "c", tmp_path / "o", "draft", "cpu", 3, ["a=1"])
+    assert command[:4] == [sys.executable, "-m", "relit", "reconstruct"]
+    assert command[-2:] == ["--set", "a=1"] and "draft" in command
