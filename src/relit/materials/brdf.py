@@ -66,15 +66,15 @@ def schlick(f0, v_dot_h):
 
 @lru_cache(maxsize=1)
 def albedo_table() -> np.ndarray:
-    """Directional albedo E(n.v, roughness) of the lobe with F = 1, (TABLE, TABLE) float32, rows roughness, columns n.v,
-    nodes at the centres of equal cells; VNDF-sampled: E = mean of G2 / G1(v) over 64 x 64 stratified samples."""
+    """Directional albedo E(n.v, roughness) of the lobe with F = 1, (TABLE, TABLE) float32, rows roughness from 0 to 1, columns n.v
+    at the centres of equal cells; VNDF-sampled: E = mean of G2 / G1(v) over 64 x 64 stratified samples."""
     c = (np.arange(TABLE) + 0.5) / TABLE
     u = (np.arange(64) + 0.5) / 64
     u1, u2 = (x.ravel()[None] for x in np.meshgrid(u, u))
     out = np.zeros((TABLE, TABLE))
     mu = c[:, None]
     v = np.stack([np.sqrt(1 - mu**2), 0 * mu, mu], -1)  # [TABLE, 1, 3]
-    for row, rough in enumerate(c):
+    for row, rough in enumerate(np.linspace(0, 1, TABLE)):
         a = max(rough**2, MIN_ALPHA)
         vh = v * [a, a, 1]
         vh /= np.linalg.norm(vh, axis=-1, keepdims=True)
@@ -93,7 +93,7 @@ def albedo_table() -> np.ndarray:
 def lobe_albedo(n_dot_v, roughness):
     """Bilinear look-up of `albedo_table`; differentiable in both arguments."""
     table = mi.Float(albedo_table().ravel())
-    x, y = dr.clip(n_dot_v * TABLE - 0.5, 0, TABLE - 1), dr.clip(roughness * TABLE - 0.5, 0, TABLE - 1)
+    x, y = dr.clip(n_dot_v * TABLE - 0.5, 0, TABLE - 1), dr.clip(roughness, 0, 1) * (TABLE - 1)
     x0, y0 = dr.minimum(mi.UInt32(dr.detach(x)), TABLE - 2), dr.minimum(mi.UInt32(dr.detach(y)), TABLE - 2)
     fx, fy = x - mi.Float(x0), y - mi.Float(y0)
     i = y0 * TABLE + x0
@@ -124,13 +124,18 @@ def specular_share(m: Surface, n, v):
         return mi.Float(dr.clip(s / dr.maximum(s + d, 1e-4), 0.15, 0.95))
 
 
+def _seen(n, v):
+    """`v` in the frame of `n`, lifted to MIN_COS where an interpolated normal looks away from the viewer."""
+    wo = mi.Frame3f(n).to_local(v)
+    wo.z = dr.maximum(wo.z, MIN_COS)
+    return dr.normalize(wo)
+
+
 def sample(m: Surface, n, v, u_lobe, u2):
     """Direction l drawn from `pdf`; u_lobe: Float, u2: Point2f, uniform in [0, 1). May fall below the horizon (pdf 0)."""
     with dr.suspend_grad():
         frame = mi.Frame3f(n)
-        wo = frame.to_local(v)
-        wo.z = dr.maximum(wo.z, MIN_COS)
-        wo = dr.normalize(wo)
+        wo = _seen(n, v)
         a = m.alpha
         vh = dr.normalize(mi.Vector3f(wo.x * a, wo.y * a, wo.z))
         z = dr.fma(1 - u2.y, 1 + vh.z, -vh.z)
@@ -145,8 +150,9 @@ def sample(m: Surface, n, v, u_lobe, u2):
 def pdf(m: Surface, n, v, l):
     """Density of `sample` in solid angle (Float, detached)."""
     with dr.suspend_grad():
-        n_dot_l, n_dot_v = dr.dot(n, l), dr.maximum(dr.dot(n, v), MIN_COS)
-        h = dr.normalize(v + l)
+        wo = _seen(n, v)
+        n_dot_l, n_dot_v = dr.dot(n, l), wo.z
+        h = dr.normalize(mi.Frame3f(n).to_world(wo) + l)
         a = m.alpha
         a2 = dr.square(a)
         g1_over_4nv = 0.5 / (n_dot_v + dr.sqrt(dr.fma(dr.square(n_dot_v), 1 - a2, a2)))  # G1(v) / (4 n.v) * 1 / (v.h) * (v.h)
