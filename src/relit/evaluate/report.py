@@ -28,11 +28,12 @@ SIDE = 240  # pixels, longer side of a picture
 VIEWS = 4  # training photos that are compared
 HELD_OUT = 2  # photos that the fit has not seen
 STILLS = 12  # of the turntable
-SPP = 24  # samples a pixel; the report is for looking, figures come from `relit evaluate`
+SPP = 24  # samples a pixel of the turntable; the report is for looking, figures come from `relit evaluate`
+SPP_COMPARED = 64  # ... of what stands beside a photo
 BACKDROP = 0.18  # linear grey behind the object
 
 STYLE = f"""
-body{{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:1180px;padding:0 1em;color:#222;background:#fafafa}}
+body{{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:1460px;padding:0 1em;color:#222;background:#fafafa}}
 h1{{font-size:1.6em;margin-bottom:.1em}}h2{{font-size:1.15em;margin:2em 0 .5em;border-bottom:1px solid #ccc}}
 .row{{display:flex;flex-wrap:wrap;gap:10px;margin-bottom:10px}}figure{{margin:0}}figcaption{{font-size:12px;color:#555}}
 img{{display:block;border-radius:3px}}svg{{background:#fff;border:1px solid #ddd;border-radius:3px}}
@@ -94,7 +95,7 @@ def _comparison(asset: Asset, scene, capture: Capture | None) -> str:
         pixels = photos[name].load()
         small = _fitted(camera)
         photo = _resized(pixels.rgb, small)
-        picture = render(scene, small, spp=SPP)
+        picture = render(scene, small, spp=SPP_COMPARED)
         seen = picture[..., 3] > 0.5
         if pixels.mask is not None:
             photo = photo * _resized(pixels.mask[..., None], small)
@@ -102,8 +103,9 @@ def _comparison(asset: Asset, scene, capture: Capture | None) -> str:
         name += " (held out)" if any(name == n for n, _ in held_out) else ""
         caption = f"{name}: {quality:.1f} dB where the object is drawn" if seen.any() else f"{name}: the object is not in view"
         pair = np.concatenate([photo, picture[..., :3], _difference(photo, picture)], axis=1)
-        rows.append(_figure(pair, caption + ". Photo, render, difference x 4"))
-    return "".join(f"<div class=row>{r}</div>" for r in rows)
+        rows.append(_figure(pair, caption))
+    how = f"Photo, render with {SPP_COMPARED} samples a pixel, difference x 4. PSNR of sRGB pictures at this size, noise included."
+    return f"<div class=row>{''.join(rows)}</div><p>{how}</p>" if rows else ""
 
 
 def _difference(photo: np.ndarray, picture: np.ndarray) -> np.ndarray:

@@ -1,0 +1,347 @@
+"""Wrong input gets an answer: what, why, fix and the right exit code, through the real command line; nothing is overwritten."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from relit import cli
+from relit.cameras.se3 import look_at
+from relit.conventions import world_from_gl_camera
+from relit.images import write_linear
+
+SIDE, FOV = 48, 0.7
+
+
+def eye(i, n=6):
+    angle = 2 * np.pi * i / n
+    return np.array([3 * np.sin(angle), 0.8, 3 * np.cos(angle)])
+
+
+def picture(i, n=6):
+    """RGBA (48, 48, 4) uint8: a ball of radius .7 at the origin with stripes, seen from `eye(i)`."""
+    pose = look_at(eye(i, n), np.zeros(3))
+    focal = 0.5 * SIDE / np.tan(0.5 * FOV)
+    x, y = np.meshgrid(np.arange(SIDE) + 0.5 - SIDE / 2, np.arange(SIDE) + 0.5 - SIDE / 2)
+    d = np.stack([x / focal, y / focal, np.ones_like(x)], -1) @ pose[:3, :3].T
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    b, c = d @ pose[:3, 3], pose[:3, 3] @ pose[:3, 3] - 0.7**2
+    hit = b * b > c
+    point = pose[:3, 3] - (b + np.sqrt(np.maximum(b * b - c, 0)))[..., None] * d
+    shade = 0.5 + 0.4 * np.sin(9 * point) * np.sign(np.sin(7 * point[..., ::-1]))
+    return (np.concatenate([shade * hit[..., None], hit[..., None]], -1) * 255).astype(np.uint8)
+
+
+def write_capture(folder, n=6, mode="RGBA"):
+    """NeRF-synthetic layout: transforms.json and n PNGs."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i in range(n):
+        Image.fromarray(picture(i, n)).convert(mode).save(folder / f"images/p{i}.png")
+        pose = world_from_gl_camera(look_at(eye(i, n), np.zeros(3)))
+        frames.append({"file_path": f"images/p{i}.png", "transform_matrix": pose.tolist()})
+    write_transforms(folder, {"camera_angle_x": FOV, "frames": frames})
+    return folder
+
+
+def write_transforms(folder, content):
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def edit(folder, change):
+    content = json.loads((folder / "transforms.json").read_text())
+    change(content)
+    write_transforms(folder, content)
+
+
+def photos_only(folder):
+    (folder / "transforms.json").unlink()
+
+
+# ---------------------------------------------------------------- the table: how the input is spoilt, the exit code, what is said
+
+
+def empty(f):
+    for p in (f / "images").iterdir():
+        p.unlink()
+    photos_only(f)
+
+
+def one_photo(f):
+    for i in range(1, 6):
+        (f / f"images/p{i}.png").unlink()
+    photos_only(f)
+
+
+def one_frame(f):
+    edit(f, lambda c: c.update(frames=c["frames"][:1]))
+
+
+def missing_photos(f):
+    for i in (0, 1, 3, 4):
+        (f / f"images/p{i}.png").unlink()
+
+
+def renamed_photos(f):
+    for i in range(6):
+        (f / f"images/p{i}.png").rename(f / f"images/other{i}.png")
+
+
+def other_size(f):
+    edit(f, lambda c: c.update(w=640, h=480, fl_x=500.0))
+
+
+def truncated(f):
+    data = picture(0)[..., :3]
+    Image.fromarray(data).save(f / "images/p0.jpg", quality=95)
+    whole = (f / "images/p0.jpg").read_bytes()
+    (f / "images/p0.jpg").write_bytes(whole[: len(whole) // 2])
+    edit(f, lambda c: c["frames"][0].update(file_path="images/p0.jpg"))
+
+
+def not_an_image(f):
+    (f / "images/p0.png").write_text("these are not pixels")
+
+
+def nan_exr(f):
+    rgba = picture(0).astype(np.float32) / 255
+    rgba[20:24, 20:24, 0] = np.nan
+    write_linear(f / "images/p0.exr", rgba)
+    edit(f, lambda c: c["frames"][0].update(file_path="images/p0.exr"))
+
+
+def black_masks(f):
+    for i in range(6):
+        rgba = picture(i)
+        rgba[..., 3] = 0
+        Image.fromarray(rgba).save(f / f"images/p{i}.png")
+
+
+def white_masks(f):
+    (f / "masks").mkdir()
+    for i in range(6):
+        Image.fromarray(picture(i)[..., :3]).save(f / f"images/p{i}.png")
+        Image.new("L", (SIDE, SIDE), 255).save(f / f"masks/p{i}.png")
+
+
+def inverted_masks(f):
+    (f / "masks").mkdir()
+    for i in range(6):
+        Image.fromarray(picture(i)[..., :3]).save(f / f"images/p{i}.png")
+        Image.fromarray(255 - picture(i)[..., 3]).save(f / f"masks/p{i}.png")
+
+
+def masks_of_another_size(f):
+    (f / "masks").mkdir()
+    for i in range(6):
+        Image.fromarray(picture(i)[..., :3]).save(f / f"images/p{i}.png")
+        Image.new("L", (SIDE // 2, SIDE * 2), 128).save(f / f"masks/p{i}.png")
+
+
+def away(f):
+    """Every camera turned by 180 degrees about its own vertical axis."""
+    turn = np.diag([-1.0, 1.0, -1.0, 1.0])
+
+    def change(c):
+        for frame in c["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ turn).tolist()
+
+    edit(f, change)
+
+
+def no_json(f):
+    (f / "transforms.json").write_text('{"frames": [')
+
+
+def nan_pose(f):
+    text = (f / "transforms.json").read_text()
+    (f / "transforms.json").write_text(text.replace("3.0", "NaN", 1) if "3.0" in text else text.replace("0.8", "NaN", 1))
+
+
+def no_focal(f):
+    edit(f, lambda c: c.pop("camera_angle_x"))
+
+
+def no_pose(f):
+    edit(f, lambda c: c["frames"][2].pop("transform_matrix"))
+
+
+def textureless(f):
+    photos_only(f)
+    for i in range(6):
+        Image.new("RGB", (SIDE * 2, SIDE * 2), (128, 128, 128)).save(f / f"images/p{i}.png")
+
+
+FAULTS = [
+    (empty, 3, "no "),
+    (one_photo, 3, "1 photo is not enough"),
+    (one_frame, 3, "1 photo is not enough"),
+    (missing_photos, 3, "4 of 6 photos"),
+    (renamed_photos, 3, "p0.png"),
+    (other_size, 3, "48"),
+    (truncated, 3, "p0.jpg"),
+    (not_an_image, 3, "p0.png"),
+    (nan_exr, 3, "p0.exr"),
+    (black_masks, 3, "mask"),
+    (white_masks, 3, "mask"),
+    (masks_of_another_size, 3, "mask"),
+    (away, 3, "camera"),
+    (no_json, 3, "transforms.json"),
+    (nan_pose, 3, "transforms.json"),
+    (no_focal, 3, "focal"),
+    (no_pose, 3, "p2.png"),
+    (textureless, 4, "0 of 6"),
+]
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return write_capture(tmp_path / "photos")
+
+
+def relit(capsys, *argv):
+    code = cli.main([str(a) for a in argv])
+    out = capsys.readouterr()
+    return code, out.out, out.err
+
+
+def answered(code, err, expected, said):
+    """One complete answer and no stack trace."""
+    assert code == expected, err
+    assert "Traceback" not in err and "error: " in err and said in err
+    assert "why: " in err or "fix: " in err
+
+
+@pytest.mark.parametrize("spoil, code, said", FAULTS, ids=lambda v: v.__name__ if callable(v) else None)
+def test_spoilt_input(capsys, tmp_path, capture, spoil, code, said):
+    spoil(capture)
+    before = {p: p.read_bytes() for p in capture.rglob("*") if p.is_file()}
+    got, out, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--quality", "draft", "--device", "cpu")
+    answered(got, err, code, said)
+    assert out == ""
+    assert before == {p: p.read_bytes() for p in capture.rglob("*") if p.is_file()}
+    assert not (tmp_path / "run/asset").exists()
+
+
+def test_the_unspoilt_capture_is_recognised(capsys, capture):
+    """The table above proves nothing if this fails."""
+    code, out, _ = relit(capsys, "inspect", capture, "--json")
+    found = json.loads(out)
+    assert code == 0 and found["photos"] == 6 and found["cameras"] == "given" and found["sizes"] == [[48, 48]]
+    assert all(0.05 < share < 0.6 for share in found["masks"].values())
+    assert np.linalg.norm(found["sphere"]["centre"]) < 0.3 and 0.7 < found["sphere"]["radius"] < 1.8
+    code, out, _ = relit(capsys, "inspect", capture)
+    assert code == 0 and "6 of 48x48 pixels" in out and "recognised as" in out
+
+
+def test_what_can_be_mended_is_mended_and_said(capsys, capture):
+    inverted_masks(capture)
+    (capture / "images/p5.png").unlink()
+    code, out, _ = relit(capsys, "inspect", capture, "--json")
+    found = json.loads(out)
+    assert code == 0 and found["photos"] == 5
+    assert any("inverted" in note for note in found["notes"]) and any("p5.png" in note for note in found["notes"])
+    assert all(share < 0.6 for share in found["masks"].values())
+
+
+def test_photos_of_mixed_sizes_are_named_or_read(capsys, capture):
+    photos_only(capture)
+    Image.fromarray(picture(0)).resize((96, 64)).save(capture / "images/p0.png")
+    code, out, err = relit(capsys, "inspect", capture, "--json")
+    if code:
+        answered(code, err, 3, "size")
+    else:
+        found = json.loads(out)
+        assert [96, 64] in found["sizes"] and any("size" in note for note in found["notes"])
+
+
+@pytest.mark.parametrize("flags, code, said", [
+    (["--sphere", "100,0,0,0.5"], 3, "sphere"),
+    (["--masks", "magic"], 2, "magic"),
+    (["--masks", "files"], 3, "mask"),
+    (["--set", "no_such_key=1"], 2, "unknown key 'no_such_key'"),
+    (["--set", "nonsense"], 2, "no '='"),
+    (["--device", "cdua"], 2, "Did you mean 'cuda'?"),
+])  # fmt: skip
+def test_flags_that_do_not_fit_the_input(capsys, tmp_path, capture, flags, code, said):
+    got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", *flags)
+    answered(got, err, code, said)
+    assert not (tmp_path / "run").exists()
+
+
+def test_input_that_is_not_there(capsys, tmp_path):
+    got, _, err = relit(capsys, "reconstruct", tmp_path / "nowhere", "-o", tmp_path / "run")
+    answered(got, err, 3, "nowhere")
+    (tmp_path / "notes.txt").write_text("hello")
+    got, _, err = relit(capsys, "inspect", tmp_path / "notes.txt")
+    answered(got, err, 3, "notes.txt")
+
+
+def test_config_file_with_an_unknown_key(capsys, tmp_path, capture):
+    config = tmp_path / "c.toml"
+    wrong = {"qualty = 'draft'\n": "unknown key 'qualty'", "quality = 'drft'\n": "Did you mean 'draft'?", "= 3": "cannot be read"}
+    for text, said in wrong.items():
+        config.write_text(text)
+        got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--config", config)
+        answered(got, err, 2, said)
+    config.write_text("seed = 'many'\n")
+    got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--config", config)
+    answered(got, err, 2, "seed=many is no whole number")
+
+
+def test_output_that_would_be_mixed_or_overwritten(capsys, tmp_path, capture):
+    got, _, err = relit(capsys, "reconstruct", capture, "-o", capture / "run")
+    answered(got, err, 3, "lie in one another")
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("years of work")
+    for extra in ([], ["--overwrite"]):
+        got, _, err = relit(capsys, "reconstruct", capture, "-o", mine, *extra)
+        answered(got, err, 3, "nothing was overwritten")
+    assert [p.name for p in mine.iterdir()] == ["thesis.txt"]
+
+
+def test_full_disk(capsys, tmp_path, capture, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--quality", "draft")
+    monkeypatch.undo()
+    answered(got, err, 5, "the disk is full")
+
+
+def test_too_little_memory(capsys, tmp_path, capture, monkeypatch):
+    from relit import plan
+
+    monkeypatch.setattr(plan, "available_memory", lambda: 2e8)
+    got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
+    answered(got, err, 5, "of memory")
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_libllvm_in_a_fresh_process(tmp_path, capture):
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(tmp_path / "nowhere.so")}
+    command = [sys.executable, "-m", "relit", "reconstruct", str(capture), "-o", str(tmp_path / "run"), "--device", "cpu"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60)
+    answered(done.returncode, done.stderr, 5, "libLLVM")
+    assert "apt-get install" in done.stderr
+
+
+@pytest.mark.parametrize("verb, flags", [
+    ("export", ["-o", "x.glb"]),
+    ("evaluate", ["--truth", "."]),
+    ("relight", ["--light", "l.hdr", "-o", "pictures"]),
+])  # fmt: skip
+def test_verbs_that_need_an_asset(capsys, tmp_path, monkeypatch, verb, flags):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    got, _, err = relit(capsys, verb, "empty", *flags)
+    answered(got, err, 3, "asset folder")
