@@ -69,12 +69,18 @@ def open_input(path: Path, job: Job) -> Capture:
     return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side)
 
 
-def input_digests(capture: Capture, path: Path) -> dict[str, str]:
-    """Content digests of the photos and of the small files (cameras, masks) beside them."""
+BESIDE = ("sparse", "masks", "mask", "segmentations", "silhouettes", "normals", "normal")  # folders whose files decide as well
+
+
+def input_digests(capture: Capture) -> dict[str, str]:
+    """Content digests of the photos, and of the cameras, masks and normal maps beside them."""
     root = capture.root if capture.root.is_dir() else capture.root.parent
-    names = [p.name for p in (*capture.photos, *capture.held_out)]
-    small = [p.name for p in sorted(root.iterdir()) if p.suffix.lower() in (".json", ".txt", ".npz", ".npy", ".bin") and p.is_file()]
-    return digests(root, sorted({n for n in (*names, *small) if (root / n).is_file()}))
+    files = {root / p.name for p in (*capture.photos, *capture.held_out)}
+    files |= {p for p in root.iterdir() if p.suffix.lower() in (".json", ".txt", ".npz", ".npy", ".bin")}
+    for folder in BESIDE:
+        files |= set((root / folder).rglob("*"))
+    names = sorted(p.relative_to(root).as_posix() for p in files if p.is_file() and p.is_relative_to(root))
+    return digests(root, names)
 
 
 # ---------------------------------------------------------------- cost

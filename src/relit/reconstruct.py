@@ -51,7 +51,7 @@ def reconstruct(
     cost = estimate(capture, job)
     check_memory(cost, chosen)
     record = {"input": Path(input).resolve().name, **dataclasses.asdict(job), "capture": kind, "settings": dataclasses.asdict(options)}
-    with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture, Path(input))) as run:
+    with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
         asset_folder = run.folder / "asset"
         if run.done("asset"):
             run.say(f"this run is complete: {asset_folder}")
