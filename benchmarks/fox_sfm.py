@@ -21,9 +21,13 @@ from relit.capture import open_capture
 
 
 def fox_folder() -> Path:
-    """multiview_fox in RELIT_SHARED or ../shared."""
-    shared = Path(os.environ.get("RELIT_SHARED") or Path(__file__).resolve().parents[2] / "shared")
-    return shared / "data" / "real" / "multiview_fox"
+    """multiview_fox in the folder that RELIT_DATA names, or in shared/data beside the repository or in it."""
+    here = Path(__file__).resolve().parents[1]
+    places = [os.environ.get("RELIT_DATA"), here / "shared" / "data", here.parent / "shared" / "data"]
+    found = next((Path(p) for p in places if p and Path(p).is_dir()), None)
+    if found is None:
+        raise SystemExit("the fox photos are not there: set RELIT_DATA to the folder of the third-party data")
+    return found / "real" / "multiview_fox"
 
 
 def fox_sfm(folder: Path, seed: int = 0) -> dict[str, float]:
