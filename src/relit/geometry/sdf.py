@@ -125,11 +125,11 @@ def gather_rows_at(grid: SdfGrid, values: np.ndarray) -> np.ndarray:
     return out
 
 
-def smoothness_gradient(grid: SdfGrid, eikonal, laplacian):
-    """Gradient [rows] of mean over the band of eikonal (|∇S| - 1)^2 + laplacian (h ΔS)^2 with respect to the row values.
+def smoothness_gradient(grid: SdfGrid, eikonal):
+    """Two Floats [rows]: the gradient of eikonal * mean over the band of (|∇S| - 1)^2 with respect to the row values (SfD Eq. 4,
+    E_reg), and L S, the mean of the six neighbours minus the value.
 
-    eikonal, laplacian: opaque Floats (weights). SfD Eq. (4) E_reg for the first term; the second keeps the level sets smooth.
-    Central differences; nodes at the border of the cube take no part.
+    eikonal: opaque Float. Central differences; nodes at the border of the cube take no part.
     """
     n, h = grid.n, grid.h
     count = grid.rows - 1
@@ -141,25 +141,44 @@ def smoothness_gradient(grid: SdfGrid, eikonal, laplacian):
     g = [(p - m) / (2 * h) for p, m, _ in pairs]
     norm = dr.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     ke = eikonal * (2.0 / count) * (1 - 1 / dr.maximum(norm, 0.05))
-    lap = pairs[0][0] + pairs[0][1] + pairs[1][0] + pairs[1][1] + pairs[2][0] + pairs[2][1] - 6 * centre
-    kl = laplacian * (2.0 / (count * h * h)) * lap
+    around = pairs[0][0] + pairs[0][1] + pairs[1][0] + pairs[1][1] + pairs[2][0] + pairs[2][1]
     out = dr.zeros(mi.Float, grid.rows)
     for c, (_, _, k) in enumerate(pairs):
         e = ke * g[c] / (2 * h)
-        dr.scatter_add(out, kl + e, dr.gather(mi.UInt32, grid.index, a + k, ok), ok, mode=dr.ReduceMode.Direct)
-        dr.scatter_add(out, kl - e, dr.gather(mi.UInt32, grid.index, a - k, ok), ok, mode=dr.ReduceMode.Direct)
-    dr.scatter_add(out, -6 * kl, dr.arange(mi.UInt32, count) + 1, ok, mode=dr.ReduceMode.Direct)
+        dr.scatter_add(out, e, dr.gather(mi.UInt32, grid.index, a + k, ok), ok, mode=dr.ReduceMode.Direct)
+        dr.scatter_add(out, -e, dr.gather(mi.UInt32, grid.index, a - k, ok), ok, mode=dr.ReduceMode.Direct)
+    diffusion = dr.zeros(mi.Float, grid.rows)
+    dr.scatter(diffusion, dr.select(ok, around * (1 / 6) - centre, 0), dr.arange(mi.UInt32, count) + 1)
+    return out, diffusion
+
+
+def neighbour_mean_difference(grid: SdfGrid, rows):
+    """L applied to a row array (Float [rows], row 0 is 0): mean of the six neighbours minus the value, 0 at nodes whose neighbours leave the band.
+
+    L L S removes noise of the grid's own scale from S and leaves curvature alone, where L S would shrink thin parts.
+    """
+    n = grid.n
+    a = grid.nodes
+    x, y, z = a % n, (a // n) % n, a // (n * n)
+    ok = (x > 0) & (x < n - 1) & (y > 0) & (y < n - 1) & (z > 0) & (z < n - 1)
+    around = mi.Float(0)
+    for k in (1, n, n * n):
+        for node in (a + k, a - k):
+            row = dr.gather(mi.UInt32, grid.index, node, ok)
+            ok &= row != 0
+            around += dr.gather(mi.Float, rows, row, ok)
+    own = dr.arange(mi.UInt32, grid.rows - 1) + 1
+    out = dr.zeros(mi.Float, grid.rows)
+    dr.scatter(out, dr.select(ok, around * (1 / 6) - dr.gather(mi.Float, rows, own), 0), own)
     return out
 
 
-def smoothness_energy(grid: SdfGrid, eikonal: float, laplacian: float) -> float:
-    """The energy whose gradient `smoothness_gradient` returns (NumPy, for tests and reports)."""
+def eikonal_energy(grid: SdfGrid) -> float:
+    """The energy whose gradient `smoothness_gradient` returns, for weight 1 (NumPy, for tests and reports)."""
     v, h = dense_values(grid).astype(np.float64), grid.h
-    c = v[1:-1, 1:-1, 1:-1]
     sides = [(np.roll(v, -1, k)[1:-1, 1:-1, 1:-1], np.roll(v, 1, k)[1:-1, 1:-1, 1:-1]) for k in (0, 1, 2)]
     norm = np.sqrt(sum(((p - m) / (2 * h)) ** 2 for p, m in sides))
-    lap = (sum(p + m for p, m in sides) - 6 * c) / h
     band = np.zeros(grid.n**3, bool)
     band[np.array(grid.nodes)] = True
     band = band.reshape(v.shape)[1:-1, 1:-1, 1:-1]
-    return float((eikonal * (norm - 1) ** 2 + laplacian * lap**2)[band].sum() / (grid.rows - 1))
+    return float(((norm - 1) ** 2)[band].sum() / (grid.rows - 1))

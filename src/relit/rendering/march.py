@@ -6,7 +6,7 @@ NeuS (Wang et al. 2021, Eq. 13): along a ray, between two samples with signed di
 
 and the operation returns per ray Σ w f (features), Σ w (opacity), Σ w t (depth) and Σ w ∇s (normal, not normalised).
 
-The adjoint replays the march instead of storing samples. With v_i = gF·f_i + gD t_i + gN·∇s_i the loss is Σ w_i v_i + gT T_end, so
+The adjoint replays the march instead of storing samples. With v_i = gF·f_i + gD t_i + gN·∇s_i (f and ∇s at the END of step i, t in its middle) the loss is Σ w_i v_i + gT T_end, so
 
     ∂L/∂α_i = T_i v_i - (Σ_{j>i} w_j v_j + gT T_end) / (1 - α_i),
 
@@ -26,7 +26,7 @@ import mitsuba as mi
 from relit.geometry.sdf import SdfGrid
 
 MAX_STEPS = 600
-MIN_ALPHA = 1e-4  # samples below it contribute nothing and are not shaded
+MIN_ALPHA = 1e-3  # samples below it contribute nothing and are not shaded
 MIN_TRANSMITTANCE = 1e-3
 ACCELERATE = 5.0  # in empty space a step reaches to where |s| inv_s = ACCELERATE, where Φ is within 1 % of 0 or 1
 
@@ -116,23 +116,21 @@ def _march(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt):
         step = dr.maximum(dt, s0 - ACCELERATE / inv_s)
         tn = t + step
         cell = _cell(o + d * tn, n)
-        s1 = _trilinear(_fetch8(grid.values, cell, n), cell.f)
+        c8 = _fetch8(grid.values, cell, n)
+        s1 = _trilinear(c8, cell.f)
         a0, a1 = _phi(s0 * inv_s), _phi(s1 * inv_s)
         alpha = dr.clip((a0 - a1) / (a0 + 1e-5), 0, 1)
         if alpha > MIN_ALPHA:
-            tm = t + 0.5 * step
-            mid = _cell(o + d * tm, n)
-            c8 = _fetch8(grid.values, mid, n)
             rows8, weights = [], []
-            for k, w in _corners(mid, n):
+            for k, w in _corners(cell, n):
                 rows8.append(dr.gather(mi.UInt32, grid.index, k))
                 weights.append(w)
             f = _fetch_features(features, rows8, weights, packets)
             weight = T * alpha
             for k in range(len(F)):
                 F[k] = dr.fma(weight, f[k], F[k])
-            N = dr.fma(_trilinear_gradient(c8, mid.f, n), weight, N)
-            D = dr.fma(weight, tm, D)
+            N = dr.fma(_trilinear_gradient(c8, cell.f, n), weight, N)
+            D = dr.fma(weight, t + 0.5 * step, D)
         T = T * (1 - alpha)
         t = tn
         s0 = s1
@@ -140,12 +138,8 @@ def _march(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt):
     return F, N, D, T, i
 
 
-def _scatter(buffer, value, row):
-    dr.scatter_add(buffer, value, row, mode=dr.ReduceMode.Direct)
-
-
 def _scatter_point(grid, gs, cell, g, g_gradient, active):
-    """Carry ∂L/∂s = g and ∂L/∂(∇s) = g_gradient (or None) at a point to the eight rows of its cell."""
+    """Carry ∂L/∂s = g and ∂L/∂(∇s) = g_gradient at a point to the eight rows of its cell."""
     n = grid.n
     fx, fy, fz = cell.f
     k = 0.5 * (n - 1)
@@ -156,8 +150,7 @@ def _scatter_point(grid, gs, cell, g, g_gradient, active):
             for dx in (0, 1):
                 wx, sx = (fx, k) if dx else (1 - fx, -k)
                 value = g * (wx * wy * wz)
-                if g_gradient is not None:
-                    value += g_gradient.x * (sx * wy * wz) + g_gradient.y * (wx * sy * wz) + g_gradient.z * (wx * wy * sz)
+                value += g_gradient.x * (sx * wy * wz) + g_gradient.y * (wx * sy * wz) + g_gradient.z * (wx * wy * sz)
                 row = dr.gather(mi.UInt32, grid.index, cell.base + (dz * n + dy) * n + dx, active)
                 dr.scatter_add(gs, value, row, active, mode=dr.ReduceMode.Direct)
 
@@ -174,8 +167,10 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
     c8 = _fetch8(grid.values, cell, n)
     s0 = _trilinear(c8, cell.f)
     n0 = _trilinear_gradient(c8, cell.f, n)
-    pending = mi.Float(0)  # ∂L/∂s_0 left by the step before
-    while (t < t1) & (T > MIN_TRANSMITTANCE) & (i < MAX_STEPS):
+    pending, pendingN = mi.Float(0), mi.Vector3f(0)  # ∂L/∂s_0 and ∂L/∂∇s_0 left by the step before: one scatter per point
+    # One turn more than the march where a point still waits for its scatter: a scatter after the loop would run the loop twice.
+    while ((t < t1) & (T > MIN_TRANSMITTANCE) & (i < MAX_STEPS)) | (pending != 0):
+        alive = (t < t1) & (T > MIN_TRANSMITTANCE) & (i < MAX_STEPS)
         step = dr.maximum(dt, s0 - ACCELERATE / inv_s)
         tn = t + step
         end = _cell(o + d * tn, n)
@@ -184,18 +179,15 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
         n1 = _trilinear_gradient(c8, end.f, n)
         a0, a1 = _phi(s0 * inv_s), _phi(s1 * inv_s)
         alpha = dr.clip((a0 - a1) / (a0 + 1e-5), 0, 1)
-        g0, g1 = mi.Float(pending), mi.Float(0)
-        shaded = alpha > MIN_ALPHA
+        g0, g1, gN1 = mi.Float(pending), mi.Float(0), mi.Vector3f(0)
+        shaded = alive & (alpha > MIN_ALPHA)
         if shaded | (pending != 0):
-            tm = t + 0.5 * step
-            mid = _cell(o + d * tm, n)
-            m8 = _fetch8(grid.values, mid, n)
             rows8, weights = [], []
-            for k, w in _corners(mid, n):
+            for k, w in _corners(end, n):
                 rows8.append(dr.gather(mi.UInt32, grid.index, k))
                 weights.append(w)
             f = _fetch_features(features, rows8, weights, packets)
-            v = gD * tm + dr.dot(gN, _trilinear_gradient(m8, mid.f, n))
+            v = gD * (t + 0.5 * step) + dr.dot(gN, n1)
             for k in range(len(f)):
                 v = dr.fma(gF[k], f[k], v)
             w = dr.select(shaded, T * alpha, 0)
@@ -207,30 +199,26 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
             ga0 = galpha * (a1 + 1e-5) / dr.square(a0 + 1e-5)
             g1 = ga1 * a1 * (1 - a1) * inv_s
             g0 += ga0 * a0 * (1 - a0) * inv_s
-            # features and normal at the middle of the step
-            gNw = gN * w
-            gp = _trilinear_hessian_times(m8, mid.f, gNw, n)
+            gN1 = gN * w
+            # features and normal at the end of the step
+            gp = _trilinear_hessian_times(c8, end.f, gN1, n)
             for k in range(packets):
                 gfk = mi.Vector4f(gF[4 * k] * w, gF[4 * k + 1] * w, gF[4 * k + 2] * w, gF[4 * k + 3] * w)
                 for row, weight in zip(rows8, weights):
-                    _scatter(gf, gfk * weight, row * packets + k)
-                gp += _feature_position_gradient(features, rows8, mid.f, gfk, packets, k, n)
-            _scatter_point(grid, gs, mid, mi.Float(0), gNw, shaded)
-            _scatter_point(grid, gs, cell, g0, None, g0 != 0)
+                    dr.scatter_add(gf, gfk * weight, row * packets + k, shaded, mode=dr.ReduceMode.Direct)
+                gp += _feature_position_gradient(features, rows8, end.f, gfk, packets, k, n)
             go += gp
-            gd += gp * tm
+            gd += gp * tn
+            _scatter_point(grid, gs, cell, g0, pendingN, g0 != 0)
         go += n0 * g0
         gd += n0 * (g0 * t)
-        pending = mi.Float(g1)
+        pending, pendingN = mi.Float(g1), mi.Vector3f(gN1)
         T = T * (1 - alpha)
         t = tn
         s0 = s1
         n0 = n1
         cell.base, cell.f = end.base, end.f
         i = i + 1
-    _scatter_point(grid, gs, cell, pending, None, pending != 0)
-    go += n0 * pending
-    gd += n0 * (pending * t)
     return go, gd
 
 
@@ -248,6 +236,7 @@ class _MarchOp(dr.CustomOp):
         self.args = (grid, dr.detach(features), dr.detach(o), dr.detach(d), dr.detach(t0), dr.detach(t1), inv_s, dt)
         with dr.suspend_grad():
             F, N, D, T, steps = _march(*self.args)
+            dr.eval(F, N, D, T, steps)  # or the adjoint would march twice
         self.out = (F, N, D, T)
         return F, N, D, T, steps
 

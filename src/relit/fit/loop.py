@@ -1,0 +1,53 @@
+"""The only optimisation loop, and the only optimiser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+class Adam:
+    """Adam (Kingma & Ba 2015) on one flat Dr.Jit array, with a step that may change without compiling a new kernel."""
+
+    def __init__(self, size: int, beta1: float = 0.9, beta2: float = 0.99):
+        self.m, self.v = dr.zeros(mi.Float, size), dr.zeros(mi.Float, size)
+        self.beta1, self.beta2, self.t = beta1, beta2, 0
+
+    def step(self, parameter, gradient, rate: float):
+        """The next value of `parameter` (Float, same size). rate: largest move of one entry per step."""
+        self.t += 1
+        b1, b2 = self.beta1, self.beta2
+        size = dr.opaque(mi.Float, rate / (1 - b1**self.t))
+        correction = dr.opaque(mi.Float, 1 / (1 - b2**self.t))
+        self.m = b1 * self.m + (1 - b1) * gradient
+        self.v = b2 * self.v + (1 - b2) * dr.square(gradient)
+        out = parameter - size * self.m / (dr.sqrt(self.v * correction) + 1e-12)
+        dr.schedule(out, self.m, self.v)
+        return out
+
+    def state(self) -> dict[str, Any]:
+        import numpy as np
+
+        return {"m": np.array(self.m), "v": np.array(self.v), "t": np.array(self.t)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.m, self.v, self.t = mi.Float(state["m"]), mi.Float(state["v"]), int(state["t"])
+
+
+def cosine_decay(e: float, final: float) -> float:
+    """1 at e = 0, `final` at e = 1."""
+    import math
+
+    return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * min(max(e, 0.0), 1.0)))
+
+
+def run_steps(stage, first: int, last: int, step: Callable[[int], dict], save: Callable[[], dict] | None = None, name: str = "checkpoint"):
+    """Call step(i) for i in [first, last), report its losses, and save a checkpoint when one is due."""
+    for i in range(first, last):
+        losses = step(i)
+        stage.step(i + 1, **{name: (lambda v=value: float(v[0])) for name, value in losses.items()})
+        if save is not None and stage.checkpoint_due():
+            stage.save(name, step=i + 1, **save())

@@ -1,0 +1,144 @@
+"""All training pixels on the device, and batches of rays through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from relit.scene import Camera
+
+CAMERA_FLOATS = 16  # fx fy cx cy, then the 3x4 pose row by row
+
+
+@dataclass
+class PixelBank:
+    """views, total: counts of photos and pixels. rgbm: Float [total * 4], linear RGB and mask. normals: Float [total * 4] or None
+    (camera axes, last entry 1 where known). cameras: Float [views * 16]. offsets, widths: UInt32 [views]. candidates: UInt32, the
+    pixels that batches are drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector, translation)."""
+
+    views: int
+    total: int
+    rgbm: Any
+    normals: Any
+    cameras: Any
+    offsets: Any
+    widths: Any
+    candidates: Any
+    masked: bool
+    corrections: Any
+
+
+@dataclass
+class RayBatch:
+    """o, d: Vector3f in the unit frame, d unit. rgb: Color3f linear. mask, clipped: Float. view, pixel: UInt32. normal: Vector3f or None."""
+
+    o: Any
+    d: Any
+    rgb: Any
+    mask: Any
+    view: Any
+    pixel: Any
+    normal: Any = None
+    has_normal: Any = None
+
+
+def camera_rows(cameras: list[Camera]) -> np.ndarray:
+    """(views * 16) float32 of `cameras` (unit frame)."""
+    rows = [np.concatenate([[c.fx, c.fy, c.cx, c.cy], np.asarray(c.world_from_camera)[:3].ravel()]) for c in cameras]
+    return np.concatenate(rows).astype(np.float32)
+
+
+def make_bank(cameras: list[Camera], images: list[np.ndarray], masks: list[np.ndarray | None], normals=None, *, radius=1.0) -> PixelBank:
+    """cameras: unit frame. images: (H, W, 3) linear. masks: (H, W) or None each.
+
+    Candidates: pixels whose ray meets the object sphere and, where masks are known, lie within a margin of the mask.
+    """
+    masked = all(m is not None for m in masks)
+    sizes = [im.shape[0] * im.shape[1] for im in images]
+    offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.uint32)
+    candidates, rgbm, extra = [], [], []
+    for k, (camera, image, mask) in enumerate(zip(cameras, images, masks)):
+        h, w = image.shape[:2]
+        near = sphere_pixels(camera, radius)
+        if masked:
+            grow = max(3, round(0.03 * max(h, w)))
+            near &= binary_dilation(mask > 0.02, iterations=grow) if mask.any() else near
+        candidates.append(np.flatnonzero(near.ravel()).astype(np.uint32) + offsets[k])
+        alpha = np.ones((h, w), np.float32) if mask is None else mask
+        rgbm.append(np.concatenate([image, alpha[..., None]], -1).reshape(-1))
+        if normals is not None:
+            nk = normals[k]
+            packed = np.zeros((h, w, 4), np.float32)
+            if nk is not None:
+                packed[..., :3], packed[..., 3] = nk, np.abs(nk).sum(-1) > 0.1
+            extra.append(packed.reshape(-1))
+    return PixelBank(
+        len(images),
+        int(sum(sizes)),
+        mi.Float(np.concatenate(rgbm).astype(np.float32)),
+        mi.Float(np.concatenate(extra)) if extra else None,
+        mi.Float(camera_rows(cameras)),
+        mi.UInt32(offsets),
+        mi.UInt32(np.array([im.shape[1] for im in images], np.uint32)),
+        mi.UInt32(np.concatenate(candidates)),
+        masked,
+        dr.zeros(mi.Float, 6 * len(images)),
+    )
+
+
+def sphere_pixels(camera: Camera, radius: float) -> np.ndarray:
+    """(H, W) bool: pixels whose ray meets the ball of `radius` around the origin."""
+    u, v = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy)
+    d = np.stack([u, v, np.ones_like(u)], -1)
+    d = (d / np.linalg.norm(d, axis=-1, keepdims=True)) @ np.asarray(camera.world_from_camera)[:3, :3].T
+    o = camera.centre
+    b = d @ o
+    return (b * b - (o @ o - radius * radius) > 0) & ((-b + radius) > 0)
+
+
+def rays_through(cameras, view, x, y, corrections=None):
+    """Rays (o, d) through pixel positions x, y (Floats in pixels, centres at +.5) of `view`; differentiable in `corrections`."""
+    k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
+    lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
+    d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
+    o = mi.Vector3f(k[1].w, k[2].w, k[3].w)
+    if corrections is not None:
+        c = [dr.gather(mi.Float, corrections, view * 6 + j) for j in range(6)]
+        d = dr.normalize(d + dr.cross(mi.Vector3f(c[0], c[1], c[2]), d))
+        o = o + mi.Vector3f(c[3], c[4], c[5])
+    return o, d
+
+
+def locate(bank: PixelBank, pixel):
+    """View, column and row (UInt32) of flat pixel numbers."""
+    view = dr.binary_search(0, bank.views, lambda k: dr.gather(mi.UInt32, bank.offsets, k, k < bank.views) <= pixel) - 1
+    local = pixel - dr.gather(mi.UInt32, bank.offsets, view)
+    width = dr.gather(mi.UInt32, bank.widths, view)
+    row = local // width
+    return view, local - row * width, row
+
+
+def batch_of(bank: PixelBank, pixel, corrections=None) -> RayBatch:
+    """Rays and targets of flat pixel numbers (UInt32)."""
+    view, x, y = locate(bank, pixel)
+    o, d = rays_through(bank.cameras, view, mi.Float(x) + 0.5, mi.Float(y) + 0.5, corrections)
+    p = dr.gather(mi.Vector4f, bank.rgbm, pixel)
+    batch = RayBatch(o, d, mi.Color3f(p.x, p.y, p.z), p.w, view, pixel)
+    if bank.normals is not None:
+        q = dr.gather(mi.Vector4f, bank.normals, pixel)
+        k = [dr.gather(mi.Vector4f, bank.cameras, view * 4 + j) for j in (1, 2, 3)]
+        batch.normal = mi.Vector3f(*[r.x * q.x + r.y * q.y + r.z * q.z for r in k])
+        batch.has_normal = q.w
+    return batch
+
+
+def draw_pixels(bank: PixelBank, rng, count: int):
+    """`count` candidate pixels, uniformly. rng: evaluated PCG32 of size `count`."""
+    total = dr.width(bank.candidates)
+    k = dr.minimum(mi.UInt32(rng.next_float32() * total), total - 1)
+    return dr.gather(mi.UInt32, bank.candidates, k)

@@ -1,0 +1,222 @@
+"""The volume pass: topology and shape by volume rendering of a signed distance field, coarse to fine.
+
+NeuS's rendering (rendering/march.py) with a deferred appearance (rendering/shade.py) against mini-batches of pixels from all photos.
+Levels double the grid; between levels the field is made a distance again and the band is cut anew around the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.losses import composite_loss, mask_loss, normal_loss
+from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.geometry.sdf import (
+    SdfGrid,
+    dense_values,
+    make_grid,
+    neighbour_mean_difference,
+    redistance,
+    resample,
+    row_features,
+    smoothness_gradient,
+    write_rows,
+)
+from relit.rendering.background import Background, render_background
+from relit.rendering.march import march, sphere_interval
+from relit.rendering.shade import CHANNELS, shade, start_features, start_reflections
+
+
+@dataclass(frozen=True)
+class VolumeOptions:
+    """One entry of `levels` and `steps` per level (nodes a side, optimisation steps). rays: rays per step.
+
+    sdf_rate: largest move of a distance per step, in voxels; feature_rate: of a feature. sharpness: inv_s * h at the start and
+    the end of a level. step: smallest marching step in voxels. eikonal, mask, normal: weights of the terms. diffusion: per step
+    the field moves by -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the value: noise of the grid's own
+    scale dies out, curvature stays. band: half width of the optimised band, voxels. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
+    """
+
+    levels: tuple[int, ...] = (64, 128, 192)
+    steps: tuple[int, ...] = (300, 450, 350)
+    rays: int = 8192
+    sdf_rate: float = 0.03
+    feature_rate: float = 0.02
+    sharpness: tuple[float, float] = (1.0, 4.0)
+    step: float = 0.9
+    eikonal: float = 0.1
+    diffusion: float = 0.2
+    mask: float = 0.2
+    normal: float = 0.05
+    band: float = 5.0
+    refine_cameras: float = 0.0
+
+
+@dataclass
+class VolumeModel:
+    """What the pass optimises. grid: SDF and features. reflections: the learnt reflection map. background: or None."""
+
+    grid: SdfGrid
+    reflections: Any
+    background: Background | None
+    inv_s: float = 0.0
+    extra: dict[str, Any] = field(default_factory=dict)
+
+
+def start_model(values: np.ndarray, level: np.ndarray, background: Background | None, full: bool) -> VolumeModel:
+    """values: (n, n, n) start distances; level: (3,) mean radiance of the object; full: optimise every node."""
+    grid = make_grid(values, CHANNELS, band=np.inf if full else 8.0, fill=start_features(level))
+    return VolumeModel(grid, start_reflections(float(level.mean())), background)
+
+
+def next_level(model: VolumeModel, n: int, band: float) -> None:
+    """Carry the field to n nodes a side: resample, make it a distance again, cut a new band."""
+    old = model.grid
+    features = np.zeros((old.n**3, old.channels), np.float32)
+    rows = row_features(old)
+    features[np.array(old.nodes)] = rows[1:]
+    known = np.zeros(old.n**3, bool)
+    known[np.array(old.nodes)] = True
+    features = _fill_unknown(features.reshape(old.n, old.n, old.n, -1), known.reshape(old.n, old.n, old.n))
+    values = redistance(resample(dense_values(old), n))
+    model.grid = make_grid(values, old.channels, band=band, features=resample(features, n))
+
+
+def _fill_unknown(features: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Nearest known value for nodes outside the band, so that resampling does not mix in zeros."""
+    from scipy.ndimage import distance_transform_edt
+
+    if known.all():
+        return features
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return features[tuple(nearest)]
+
+
+def fit_volume(bank: PixelBank, model: VolumeModel, options: VolumeOptions, stage, seed: int = 0) -> VolumeModel:
+    """Run all levels; returns the same model, optimised. Resumes from the stage's checkpoint when there is one."""
+    total, done = sum(options.steps), 0
+    saved = stage.load("checkpoint")
+    start = int(saved["step"]) if saved else 0
+    camera_adam = Adam(6 * bank.views)
+    for number, (n, steps) in enumerate(zip(options.levels, options.steps)):
+        if start >= done + steps and number + 1 < len(options.levels):
+            done += steps
+            continue
+        if saved and start > done:
+            _restore(model, bank, saved)
+        elif model.grid.n != n:
+            next_level(model, n, options.band)
+        if start >= done + steps:
+            break
+        _fit_level(bank, model, options, stage, camera_adam, first=max(start, done), begin=done, end=done + steps, seed=seed)
+        done += steps
+    assert done <= total
+    return model
+
+
+def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, seed):
+    grid = model.grid
+    h, count = grid.h, options.rays
+    rng = mi.PCG32(size=count, initstate=seed * 7919 + begin)
+    refine = options.refine_cameras > 0
+    adam = {
+        "sdf": Adam(grid.rows),
+        "features": Adam(grid.rows * grid.channels),
+        "reflections": Adam(dr.width(model.reflections)),
+    }
+    if model.background is not None:
+        adam["background"] = Adam(dr.width(model.background.cells))
+    dt = dr.opaque(mi.Float, options.step * h)
+
+    def step(i: int) -> dict:
+        e = (i - begin) / max(end - begin, 1)
+        decay = cosine_decay(e, 0.1)
+        model.inv_s = (options.sharpness[0] * (1 - e) + options.sharpness[1] * e) / h
+        inv_s = dr.opaque(mi.Float, model.inv_s)
+
+        params = [grid.row_values, grid.features, model.reflections]
+        if model.background is not None:
+            params.append(model.background.cells)
+        if refine:
+            params.append(bank.corrections)
+        dr.enable_grad(*params)
+
+        pixel = draw_pixels(bank, rng, count)
+        jitter = rng.next_float32()
+        dr.eval(pixel, jitter, rng)
+        batch = batch_of(bank, pixel, bank.corrections if refine else None)
+        with dr.suspend_grad():
+            t0, t1 = sphere_interval(dr.detach(batch.o), dr.detach(batch.d))
+            hit = t1 > t0
+            t0 = t0 + jitter * dt
+        dr.eval(batch.o, batch.d, batch.rgb, batch.mask, t0, t1)
+        m = march(grid, batch.o, batch.d, t0, t1, inv_s, dt)
+        colour, normal = shade(m, batch.d, model.reflections)
+        if model.background is not None:
+            colour = colour + m.transmittance * render_background(model.background, batch.o, batch.d, jitter)
+        loss = composite_loss(colour, batch.rgb, hit if bank.masked else None)
+        report = {"colour": loss}
+        if bank.masked:
+            term = mask_loss(m.opacity, batch.mask)
+            report["mask"] = term
+            loss = loss + options.mask * term
+        if batch.normal is not None:
+            loss = loss + options.normal * normal_loss(normal, batch.normal, batch.has_normal * dr.detach(m.opacity))
+        dr.backward(loss)
+
+        smooth, diffusion = smoothness_gradient(grid, dr.opaque(mi.Float, options.eikonal))
+        gradients = [dr.grad(grid.row_values) + smooth] + [dr.grad(p) for p in params[1:]]
+        dr.disable_grad(*params)
+        dr.eval(gradients, diffusion, report)
+        kappa = dr.opaque(mi.Float, options.diffusion)
+        moved = adam["sdf"].step(dr.detach(grid.row_values), gradients[0], options.sdf_rate * h * decay)
+        grid.row_values = moved - kappa * neighbour_mean_difference(grid, diffusion)
+        grid.features = adam["features"].step(dr.detach(grid.features), gradients[1], options.feature_rate * decay)
+        model.reflections = adam["reflections"].step(dr.detach(model.reflections), gradients[2], 0.02 * decay)
+        if model.background is not None:
+            model.background.cells = adam["background"].step(dr.detach(model.background.cells), gradients[3], 0.05 * decay)
+        if refine:
+            bank.corrections = camera_adam.step(dr.detach(bank.corrections), gradients[-1], options.refine_cameras * decay)
+        dr.eval(grid.row_values)
+        write_rows(grid)
+        return report
+
+    run_steps(stage, first, end, step, lambda: _state(model, bank))
+
+
+def _state(model: VolumeModel, bank: PixelBank) -> dict[str, np.ndarray]:
+    grid = model.grid
+    out = {
+        "values": dense_values(grid),
+        "features": row_features(grid),
+        "nodes": np.array(grid.nodes),
+        "reflections": np.array(model.reflections),
+        "corrections": np.array(bank.corrections),
+        "inv_s": np.array(model.inv_s),
+    }
+    if model.background is not None:
+        out["background"] = np.array(model.background.cells)
+    return out
+
+
+def _restore(model: VolumeModel, bank: PixelBank, saved: dict[str, np.ndarray]) -> None:
+    values, n = saved["values"], saved["values"].shape[0]
+    features = np.zeros((n**3, CHANNELS), np.float32)
+    features[saved["nodes"]] = saved["features"][1:]
+    grid = make_grid(values, CHANNELS, band=np.inf)
+    index = np.zeros(n**3, np.uint32)
+    index[saved["nodes"]] = np.arange(1, len(saved["nodes"]) + 1, dtype=np.uint32)
+    grid.index, grid.nodes, grid.rows = mi.UInt32(index), mi.UInt32(saved["nodes"]), len(saved["nodes"]) + 1
+    grid.row_values = mi.Float(np.concatenate([[1.0], values.ravel()[saved["nodes"]]]).astype(np.float32))
+    grid.features = mi.Float(saved["features"].ravel())
+    model.grid = grid
+    model.reflections = mi.Float(saved["reflections"])
+    bank.corrections = mi.Float(saved["corrections"])
+    model.inv_s = float(saved["inv_s"])
+    if model.background is not None:
+        model.background.cells = mi.Float(saved["background"])

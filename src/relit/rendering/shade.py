@@ -1,0 +1,55 @@
+"""Deferred appearance of the volume pass: what a ray looks like, from the features that the march accumulated.
+
+Radiance = diffuse + tint * E(r): a view-independent part and a reflection of a small learnt environment in the direction
+mirrored at the accumulated normal. It explains highlights well enough that they do not dent the surface; the material proper is
+found later, on the mesh. Not physically based; the surface pass is.
+
+Feature channels: 0-2 diffuse radiance (linear), 3 tint. Four, not more: the adjoint's scatter of the features is its dearest part.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.rendering.march import Marched
+
+CHANNELS = 4
+ROWS, COLUMNS = 16, 32  # of the reflection map
+
+
+def start_reflections(level: float):
+    """Lat-long map of log radiance, Float [ROWS * COLUMNS * 3], in the axes of `conventions.uv_from_direction`."""
+    return mi.Float(np.full(ROWS * COLUMNS * 3, np.log(max(level, 1e-4)), np.float32))
+
+
+def start_features(level: np.ndarray) -> np.ndarray:
+    """(4,) start of every row: diffuse at `level` (3,) and little tint."""
+    return np.array([*level, 0.05], np.float32)
+
+
+def lookup_latlong(texels, height: int, width: int, d):
+    """Bilinear look-up of a lat-long Float [h * w * 3] in unit directions d -> Color3f; differentiable in texels and d.
+
+    Wraps in u, clamps in v.
+    """
+    u = dr.atan2(d.x, -d.z) * (0.5 * dr.inv_pi)
+    u = (u - dr.floor(dr.detach(u))) * width - 0.5
+    v = dr.clip(dr.safe_acos(dr.clip(d.y, -0.9999, 0.9999)) * dr.inv_pi * height - 0.5, 0, height - 1)
+    fu, fv = dr.floor(dr.detach(u)), dr.minimum(dr.floor(dr.detach(v)), height - 2)
+    x0, y0 = mi.Int32(fu), mi.UInt32(fv)
+    wx, wy = u - fu, v - fv
+    xa, xb = mi.UInt32(dr.select(x0 < 0, x0 + width, x0)), mi.UInt32(dr.select(x0 + 1 >= width, x0 + 1 - width, x0 + 1))
+    g = lambda x, y: dr.gather(mi.Color3f, texels, y * width + x)  # noqa: E731
+    top, bottom = dr.lerp(g(xa, y0), g(xb, y0), wx), dr.lerp(g(xa, y0 + 1), g(xb, y0 + 1), wx)
+    return dr.lerp(top, bottom, wy)
+
+
+def shade(m: Marched, d, reflections):
+    """Radiance premultiplied with opacity (Color3f) and the unit normal (Vector3f) of each ray."""
+    F = m.features
+    n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
+    r = d - 2 * dr.dot(d, n) * n
+    e = dr.exp(lookup_latlong(reflections, ROWS, COLUMNS, r))
+    return dr.maximum(mi.Color3f(F[0], F[1], F[2]) + dr.maximum(F[3], 0) * e, 0), n
