@@ -41,7 +41,7 @@ class Settings:
     inliers: int
     start: int
     start_angle: float
-    features: int = 4096
+    features: int = 2048
     peak: float = 0.0067
     ratio: float = 0.8
     guided: bool = False
@@ -51,7 +51,7 @@ class Settings:
 
 STANDARD = Settings("standard", inliers=20, start=60, start_angle=12.0)
 LOOSE = Settings(
-    "more and weaker features, guided matching", inliers=12, start=30, start_angle=6.0, features=8192, peak=0.002, ratio=0.85, guided=True
+    "more and weaker features, guided matching", inliers=12, start=30, start_angle=6.0, features=6000, peak=0.002, ratio=0.85, guided=True
 )
 
 

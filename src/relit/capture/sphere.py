@@ -71,23 +71,26 @@ def sphere_from_rays(cameras: list[Camera]) -> Sphere:
     origins = np.array([c.centre for c in cameras])
     axes = np.array([c.world_from_camera[:3, 2] for c in cameras])
     centre = robust_closest_point(origins, axes)
-    seen = [_sees(c, centre) for c in cameras]
-    if np.mean(seen) < 0.6:
-        raise UserError(
-            f"the cameras look away from each other: only {sum(seen)} of {len(seen)} see the point that their axes approach most",
-            "the poses use other axes than the format says (camera_from_world instead of world_from_camera, or y and z flipped), "
-            "or the photos do not go around one object",
-            "check one pose by hand, or give the object sphere",
-        )
-    distance = np.linalg.norm(origins - centre, axis=1)[np.array(seen)]
+    seen = _seen(cameras, centre)
+    distance = np.linalg.norm(origins - centre, axis=1)[seen]
     half = np.array([np.arctan(0.5 * np.sqrt(c.width / c.fx * c.height / c.fy)) for c, s in zip(cameras, seen, strict=True) if s])
     radius = min(float(np.median(distance * np.sin(half))), 0.8 * float(distance.min()))
     return Sphere(centre, radius)
 
 
-def _sees(camera: Camera, point: np.ndarray) -> bool:
-    x, y, z = camera.project(point)
-    return bool(z > 0 and 0 <= x <= camera.width and 0 <= y <= camera.height)
+def _seen(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
+    """(N,) bool: which cameras see a point. Raises UserError when fewer than 60 % do."""
+    pixels = np.array([c.project(point) for c in cameras])
+    size = np.array([(c.width, c.height) for c in cameras])
+    seen = (pixels[:, 2] > 0) & (pixels[:, :2] >= 0).all(axis=1) & (pixels[:, :2] <= size).all(axis=1)
+    if seen.mean() < 0.6:
+        raise UserError(
+            f"the cameras look away from each other: only {seen.sum()} of {len(seen)} see the point that their axes approach most",
+            "the poses use other axes than the format says (camera_from_world instead of world_from_camera, or y and z flipped), "
+            "or the photos do not go around one object",
+            "check one pose by hand, or give the object sphere",
+        )
+    return seen
 
 
 # ---------------------------------------------------------------- points
@@ -124,6 +127,7 @@ def sphere_from_masks(views: list[View]) -> Sphere:
     origins = np.array([v.camera.centre for v in views])
     rays, spread = zip(*(_mask_cone(v) for v in views), strict=True)
     centre = robust_closest_point(origins, np.array(rays))
+    _seen([v.camera for v in views], centre)
     distance = np.linalg.norm(origins - centre, axis=1)
     radius = float(np.quantile(distance * np.tan(np.array(spread)), 0.9))
     grown = [cv2.dilate((v.mask > 0.5).astype(np.uint8), np.ones((3, 3), np.uint8)) for v in views]

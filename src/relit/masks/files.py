@@ -79,7 +79,7 @@ def border_share(mask: np.ndarray) -> float:
 
 
 def looks_inverted(mask: np.ndarray) -> bool:
-    """True when the mask covers the border all around and leaves out one compact region inside."""
+    """True when the mask covers the border all around and what it leaves out lies inside, away from the border."""
     if border_share(mask) < BORDER:
         return False
     outside = mask < 0.5
@@ -88,8 +88,11 @@ def looks_inverted(mask: np.ndarray) -> bool:
         return False
     import cv2
 
+    h, w = mask.shape
     _, _, stats, _ = cv2.connectedComponentsWithStats(outside.astype(np.uint8), connectivity=8)
-    return bool(stats[1:, cv2.CC_STAT_AREA].max() > 0.6 * outside.sum())
+    x, y, bw, bh, area = stats[1:].T
+    away = (x > 0) & (y > 0) & (x + bw < w) & (y + bh < h)
+    return bool(area[away].sum() > 0.8 * area.sum())
 
 
 def judge(masks: dict[str, np.ndarray], source: str) -> tuple[bool, list[str]]:

@@ -1,0 +1,105 @@
+"""Cameras from photos alone, on drawn pictures of a textured corner of a room."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from relit import images
+from relit.cameras.se3 import camera_errors, look_at
+from relit.cameras.sfm import find_cameras
+from relit.capture import open_capture
+from relit.errors import EXIT_FAILED, UserError
+from relit.scene import Camera
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+
+
+def texture(seed):
+    rng = np.random.default_rng(seed)
+    layers = [cv2.resize(rng.uniform(size=(n, n, 3)).astype(np.float32), (512, 512), interpolation=cv2.INTER_CUBIC) for n in (16, 48, 128)]
+    return np.clip(sum(layers) / 3 * 1.6 - 0.3, 0, 1)
+
+
+TEXTURES = [texture(i) for i in range(3)]
+
+
+def photo(camera):
+    """The planes x = -1, y = 1 (below) and z = 1, each 4 x 4, with a texture on it; linear (H, W, 3)."""
+    gx, gy = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy)
+    d = np.stack([gx, gy, np.ones_like(gx)], -1) @ camera.world_from_camera[:3, :3].T
+    rgb, depth = np.full((*gx.shape, 3), 0.2, np.float32), np.full(gx.shape, np.inf)
+    for axis, level in ((0, -1.0), (1, 1.0), (2, 1.0)):
+        t = (level - camera.centre[axis]) / np.where(np.abs(d[..., axis]) < 1e-9, 1e-9, d[..., axis])
+        p = camera.centre + t[..., None] * d
+        u, v = (np.delete(p, axis, axis=-1)[..., i] for i in (0, 1))
+        hit = (t > 0) & (t < depth) & (np.abs(u) < 2) & (np.abs(v) < 2)
+        xy = [((c + 2) * 127.9).astype(np.float32) for c in (u, v)]
+        rgb[hit] = cv2.remap(TEXTURES[axis], *xy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[hit]
+        depth[hit] = t[hit]
+    return rgb
+
+
+def arc(count=8):
+    out = []
+    for i in range(count):
+        a = -0.5 + 1.0 * i / (count - 1)
+        eye = np.array([2.2 * np.cos(a) + 0.2, -0.6 - 0.25 * np.sin(3 * a), -2.2 - 1.2 * np.sin(a)])
+        pose = look_at(eye, [-0.5, 0.5, 0.5], [0, -1, 0])
+        out.append(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
+    return out
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("room")
+    for i, camera in enumerate(arc()):
+        images.write_srgb(path / f"{i}.png", photo(camera))
+    return path
+
+
+def test_a_textured_corner(folder, tmp_path):
+    truth = arc()
+    capture = open_capture(folder, masks="none")
+    found, verdict = find_cameras(capture, workdir=tmp_path)
+    assert verdict.registered == verdict.total == 8 and verdict.reason == "" and verdict.mean_error < 1.0
+    assert found.has_cameras and found.sphere is not None and len(found.points) > 50
+    poses = np.stack([p.camera.world_from_camera for p in found.photos])
+    angle, distance = camera_errors(poses, np.stack([c.world_from_camera for c in truth]))
+    assert np.median(angle) < 0.5 and np.median(distance) < 0.05
+    assert found.photos[0].camera.fx == pytest.approx(FOCAL, rel=0.05)
+    assert found.photos[0].load().rgb.shape == (found.photos[0].height, found.photos[0].width, 3)
+
+    again, same = find_cameras(capture, workdir=tmp_path)  # read back, not searched again
+    assert same == verdict
+    np.testing.assert_array_equal(again.photos[3].camera.world_from_camera, found.photos[3].camera.world_from_camera)
+
+
+def test_a_fixed_focal_stays_and_strangers_are_left_out_with_a_reason(folder, tmp_path):
+    room = tmp_path / "room"
+    room.mkdir()
+    for i in range(1, 6):
+        (room / f"{i}.png").write_bytes((folder / f"{i}.png").read_bytes())
+    images.write_srgb(room / "blank.png", np.full((HEIGHT, WIDTH, 3), 0.4))
+    found, verdict = find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focal=FOCAL)
+    assert (verdict.registered, verdict.total) == (5, 6)
+    assert "1 have fewer than 150 features" in verdict.reason and "blank.png" in verdict.reason
+    assert str(verdict).startswith("5 of 6 photos registered, because ")
+    assert len(verdict.tries) >= 2  # it tried again before it gave up on that photo
+    assert all(p.camera.fx == FOCAL for p in found.photos)
+    assert [p.name for p in found.photos] == ["1.png", "2.png", "3.png", "4.png", "5.png"]
+
+
+def test_textureless_photos_are_refused_with_the_reason(tmp_path):
+    for i in range(4):
+        images.write_srgb(tmp_path / f"{i}.png", np.full((60, 80, 3), 0.3 + 0.05 * i))
+    with pytest.raises(UserError, match="no cameras were found: 0 of 4") as caught:
+        find_cameras(open_capture(tmp_path), workdir=tmp_path / "work")
+    assert caught.value.code == EXIT_FAILED and "4 have fewer than 150 features" in caught.value.why
+
+
+def test_two_photos_are_too_few(folder, tmp_path):
+    capture = open_capture(folder, masks="none")
+    with pytest.raises(UserError, match="2 photos are not enough"):
+        find_cameras(replace(capture, photos=capture.photos[:2]), workdir=tmp_path)
