@@ -211,9 +211,9 @@ def _extras() -> list[Check]:
         found = what if have else f"{what}: not installed"
         return Check(name, True if have else None, found, "" if have else f"{sys.executable} -m pip install {wheels}")
 
-    ffmpeg, node = shutil.which("ffmpeg"), shutil.which("node")
+    node = shutil.which("node")
     return [
-        Check("ffmpeg", True, ffmpeg) if ffmpeg else module("ffmpeg", ("imageio_ffmpeg",), "imageio-ffmpeg", "mp4 turntables"),
+        module("ffmpeg", ("imageio_ffmpeg",), "imageio-ffmpeg", "H.264 videos (else MPEG-4)"),
         module("segmenter", ("rembg", "onnxruntime"), "rembg onnxruntime", "masks of photos without any hint"),
         module("HEIC", ("pillow_heif",), "pillow-heif", "photos of iPhones"),
         module("RAW", ("rawpy",), "rawpy", "raw photos of cameras"),

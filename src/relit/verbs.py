@@ -232,6 +232,7 @@ def _relight_flags(parser: Parser) -> None:
     more = parser.more.add_argument
     more("--spp", type=int, default=64, help="samples a pixel (default 64)")
     more("--size", type=int, default=None, metavar="PIXELS", help="longer side of the pictures")
+    more("--rotate", type=float, default=0.0, metavar="DEGREES", help="turn the light about the object's up")
     more("--exr", action="store_true", help="linear EXR pictures besides the PNG ones")
     more("--overwrite", action="store_true", help="replace existing pictures")
 
@@ -239,10 +240,20 @@ def _relight_flags(parser: Parser) -> None:
 def _relight(args) -> None:
     _free(args.out, args.overwrite)
     from relit.device import use_device
-    from relit.relight import relight
+    from relit.log import Log, Progress
 
     use_device(args.device)
-    relight(args.run, args.light, args.out, cameras=args.cameras, spp=args.spp, size=args.size, exr=args.exr)
+    from relit.relight import relight
+
+    progress = Progress(Log(), "relight", None)
+
+    def show(done: int, count: int) -> None:
+        progress.steps = count
+        progress.update(done)
+
+    options = {"cameras": args.cameras, "spp": args.spp, "size": args.size, "exr": args.exr, "rotate": args.rotate}
+    relight(args.run, args.light, args.out, progress=show, **options)
+    progress.log.clear()
     print(args.out)
 
 

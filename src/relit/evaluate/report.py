@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from relit.asset.asset import load_asset
-from relit.cameras.se3 import look_at
 from relit.capture.procedural import evening, studio
-from relit.conventions import linear_from_srgb, move_points
+from relit.conventions import linear_from_srgb, rotate_environment
 from relit.evaluate.curves import bars, camera_plot, curve
 from relit.evaluate.metrics import encode, psnr
 from relit.files import parse_toml, read_json, write_text
 from relit.images import encode_jpeg
 from relit.log import readable_bytes, readable_seconds
+from relit.relight import orbit
 from relit.rendering.mitsuba_scene import build_scene, render, render_channels
 from relit.run import read_metrics, read_stages
 from relit.scene import Asset, Camera, Capture
@@ -142,11 +142,12 @@ def _light(asset: Asset) -> str:
 
 
 def _turntables(asset: Asset) -> str:
-    cameras = orbit(asset, STILLS, SIDE)
+    cameras = [camera for _, camera in orbit(asset, STILLS, SIDE)]
     cells = []
     lights = {"a studio of formulas": studio(64), "an evening of formulas": evening(64)}
     for name, light in lights.items():
-        scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, light)
+        upright = rotate_environment(light, asset.world_from_asset)  # its top over the object's top
+        scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, upright)
         stills = [render(scene, c, spp=SPP, max_depth=4) for c in cameras]
         covered = np.concatenate([s[s[..., 3] > 0.5][:, :3].ravel() for s in stills])
         k = 0.9 / max(float(np.percentile(covered, 99)), 1e-6) if covered.size else 1.0
@@ -212,22 +213,6 @@ def _files(run: Path) -> str:
 # ---------------------------------------------------------------- pieces
 
 
-def orbit(asset: Asset, count: int, side: int) -> list[Camera]:
-    """`count` square cameras of `side` pixels around the asset, 20 degrees above its equator, in the world frame."""
-    low, high = asset.mesh.vertices.min(0), asset.mesh.vertices.max(0)
-    centre = 0.5 * (low + high)
-    radius = float(np.linalg.norm(asset.mesh.vertices - centre, axis=1).max())
-    place = np.asarray(asset.world_from_asset, np.float64)
-    up = place[:3, :3] @ np.array([0.0, 1.0, 0.0])
-    distance, focal = 3.4 * radius, side * 1.5  # the ball of the object fills 92 % of the frame
-    out = []
-    for angle in 2 * np.pi * np.arange(count) / count:
-        towards = np.array([np.sin(angle) * np.cos(0.35), np.sin(0.35), np.cos(angle) * np.cos(0.35)])
-        eye, target = move_points(place, centre + distance * towards), move_points(place, centre)
-        out.append(Camera(side, side, focal, focal, side / 2, side / 2, look_at(eye, target, up)))
-    return out
-
-
 def _spread(items, count: int) -> list:
     """At most `count` items, evenly spread."""
     items = list(items)
@@ -286,6 +271,3 @@ def _config(run: Path) -> dict:
 
 def _title(run: Path) -> str:
     return f"Relit: {_config(run).get('input', run.resolve().name)}"
-
-
-__all__ = ["orbit", "write_report"]
