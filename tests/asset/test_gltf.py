@@ -203,3 +203,61 @@ def test_damaged_files_get_an_answer(tmp_path, mesh, material, kind):
 def test_textures_without_coordinates_are_refused(tmp_path, mesh, material):
     with pytest.raises(UserError, match="texture coordinates"):
         write_glb(tmp_path / "a.glb", replace(mesh, uvs=None), material)
+
+
+def test_random_damage_never_ends_in_a_stack_trace(tmp_path, mesh, material):
+    """One value of the JSON replaced or removed: the file is read, or the user is told."""
+    small = replace(material, **{k: getattr(material, k)[:4, :4] for k in ("base_color", "roughness", "metallic", "specular", "normal")})
+    write_glb(tmp_path / "a.glb", mesh, small)
+    text, blob = parse(tmp_path / "a.glb")
+    text = json.dumps(text)
+
+    def places(node, before=()):
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            yield (*before, key)
+            if isinstance(value, dict | list):
+                yield from places(value, (*before, key))
+
+    rng = np.random.default_rng(0)
+    everywhere = list(places(json.loads(text)))
+    answers = 0
+    for i in rng.choice(len(everywhere), 120, replace=False):
+        doc = json.loads(text)
+        node = doc
+        for key in everywhere[i][:-1]:
+            node = node[key]
+        value = rng.choice(np.array([None, -1, 0, 1e9, 99, "x", True, "gone"], object))
+        if value == "gone":
+            del node[everywhere[i][-1]]
+        else:
+            node[everywhere[i][-1]] = value
+        (tmp_path / "b.glb").write_bytes(assemble(doc, blob))
+        try:
+            read_asset_file(tmp_path / "b.glb")
+        except UserError:
+            answers += 1
+    assert 20 < answers < 120
+
+
+def test_an_atlas_holds_repeated_textures(tmp_path, mesh, material):
+    """A part whose texture coordinates run over several tiles finds the same texels in the atlas."""
+    from relit.asset.parts import Part, merge_parts
+
+    t = replace(material, specular=None, normal=None)
+    other = replace(t, base_color=t.base_color[::-1].copy())
+    uvs = mesh.uvs.astype(float) * [3, 2] - [1, 0]
+    parts = [
+        Part(mesh.vertices, mesh.faces, mesh.normals, uvs, "a", t),
+        Part(mesh.vertices + 5, mesh.faces, mesh.normals, mesh.uvs, "b", other),
+    ]
+    merged, atlas = merge_parts(parts, tmp_path)
+
+    def look(image, uv):
+        return image[(uv[:, 1] * image.shape[0]).astype(int) % image.shape[0], (uv[:, 0] * image.shape[1]).astype(int) % image.shape[1]]
+
+    n = len(mesh.vertices)
+    off_seam = (np.abs(uvs[:, 0] - np.round(uvs[:, 0])) > 0.1) & (np.abs(uvs[:, 1] - np.round(uvs[:, 1])) > 0.1)
+    assert np.abs(look(atlas.base_color, merged.uvs[:n]) - look(t.base_color, uvs))[off_seam].max() < 0.08
+    assert np.abs(look(atlas.roughness, merged.uvs[:n]) - look(t.roughness, uvs))[off_seam].max() < 0.08
+    inside = (mesh.uvs.min(1) > 0.05) & (mesh.uvs.max(1) < 0.95)
+    assert np.abs(look(atlas.base_color, merged.uvs[n:]) - look(other.base_color, mesh.uvs))[inside].max() < 0.08

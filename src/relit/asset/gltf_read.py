@@ -44,7 +44,7 @@ class _File:
                     self.chunk = data[at + 8 : at + 8 + size]
             else:
                 self.json = json.loads(data)
-        except (ValueError, struct.error) as e:
+        except (ValueError, struct.error, RecursionError) as e:
             raise UserError("this is not a readable glTF file", str(e), f"export it again: {path}") from None
         unknown = set(self.json.get("extensionsRequired", [])) - UNDERSTOOD
         if unknown:
@@ -52,6 +52,8 @@ class _File:
                 f"the model needs glTF extensions that are not supported: {', '.join(sorted(unknown))}",
                 fix=f"export it without them: {path}",
             )
+        if not isinstance(self.json, dict):
+            raise UserError("this is not a readable glTF file", "its JSON is no object", f"export it again: {path}")
         self.buffers: dict[int, bytes] = {}
         self.images: dict[int, np.ndarray] = {}
 
@@ -228,9 +230,9 @@ def read_gltf(path: Path) -> tuple[Mesh, Material]:
     file = _File(path)
     doc = file.json
     parts, materials = [], {}
-    scene = doc.get("scenes", [{}])[doc.get("scene", 0)] if doc.get("scenes") else {"nodes": list(range(len(doc.get("nodes", []))))}
-    stack = [(n, np.eye(4), 0) for n in reversed(scene.get("nodes", []))]
     try:
+        scene = doc["scenes"][doc.get("scene", 0)] if doc.get("scenes") else {"nodes": list(range(len(doc["nodes"])))}
+        stack = [(n, np.eye(4), 0) for n in reversed(scene.get("nodes", []))]
         while stack:
             index, asset_from_parent, depth = stack.pop()
             if depth > 1000:
@@ -240,6 +242,6 @@ def read_gltf(path: Path) -> tuple[Mesh, Material]:
             for primitive in doc["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
                 parts.append(_parts(file, primitive, asset_from_node, materials))
             stack += [(c, asset_from_node, depth + 1) for c in reversed(node.get("children", []))]
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as e:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError, MemoryError) as e:
         raise UserError("the glTF file is damaged", f"{type(e).__name__}: {e}", f"export it again: {path}") from None
     return merge_parts([p for p in parts if p is not None and len(p.faces)], path)

@@ -67,6 +67,9 @@ def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
     )
     if not (np.isfinite(mesh.vertices).all() and (uvs is None or np.isfinite(uvs).all())):
         raise UserError("the model has coordinates that are not numbers", fix=f"export it again: {path}")
+    maps = (material.base_color, material.roughness, material.metallic, material.specular, material.normal)
+    if not all(a is None or np.isfinite(a).all() for a in maps):
+        raise UserError("the model has a material value that is not a number", fix=f"export it again: {path}")
     lost = ~(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 0.01)
     if lost.any():  # zero normals in the file
         mesh = replace(mesh, normals=np.where(lost[:, None], vertex_normals(mesh), mesh.normals))
