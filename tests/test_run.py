@@ -227,6 +227,14 @@ def test_a_full_disk_is_an_environment_error(tmp_path, monkeypatch):
     assert disk_error(OSError(errno.ENOENT, "no"), tmp_path) is None
 
 
+def test_what_a_killed_writer_left_is_cleared(tmp_path):
+    with Run.open(tmp_path, CONFIG) as run, run.stage("fit") as stage:
+        torn = stage.folder / ".state.npz.12345.part"
+        torn.write_bytes(b"half")
+    Run.open(tmp_path, CONFIG).close()
+    assert not torn.exists()
+
+
 def test_atomic_text(tmp_path):
     write_text(tmp_path / "a", "one")
     write_text(tmp_path / "a", "two")

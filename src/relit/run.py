@@ -67,6 +67,8 @@ class Run:
                 if inputs is not None and not (folder / "inputs.json").exists():
                     write_text(folder / "inputs.json", json.dumps(inputs, indent=1, sort_keys=True) + "\n")
                 _end_line(folder / "metrics.jsonl")
+                for torn in folder.rglob(".*.part"):  # a process was killed while it wrote
+                    torn.unlink(missing_ok=True)
             except BaseException:
                 os.close(lock)
                 raise
