@@ -69,24 +69,38 @@ def test_albedo_scale_undoes_a_known_scale():
 
 def test_surface_samples_are_uniform_by_area():
     vertices = np.array([[0, 0, 0], [3, 0, 0], [3, 1, 0], [0, 1, 0]], float)
-    points, normals = m.sample_surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]), 30_000)
+    surface = m.sample_surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]), 30_000)
+    points = surface.points[surface.uniform]
     assert points.min() >= 0 and (points <= [3, 1, 0]).all()
     np.testing.assert_allclose(points.mean(0), [1.5, 0.5, 0.0], atol=0.02)
     np.testing.assert_allclose(points.var(0), [9 / 12, 1 / 12, 0], atol=0.02)
-    np.testing.assert_allclose(normals, np.broadcast_to([0.0, 0.0, 1.0], normals.shape))
+    assert ((points[:, 1] < points[:, 0] / 3) == (surface.triangle[surface.uniform] == 0)).mean() > 0.999
+
+
+def test_nearest_point_of_a_triangle_inside_at_an_edge_and_at_a_corner():
+    a, b, c = (np.array(x, float) for x in ([0, 0, 0], [4, 0, 0], [0, 4, 0]))
+    cases = {(1, 1, 2): (1, 1, 0), (2, -3, 1): (2, 0, 0), (3, 3, -1): (2, 2, 0), (-1, -2, 5): (0, 0, 0), (9, -1, 0): (4, 0, 0)}
+    for point, nearest in cases.items():
+        np.testing.assert_allclose(m.closest_on_triangles(np.array(point, float), a, b, c), nearest, atol=1e-12)
+        np.testing.assert_allclose(m.closest_on_triangles(np.array(point, float), a, c, b), nearest, atol=1e-12)  # either winding
+    np.testing.assert_allclose(m.closest_on_triangles(np.array([1.0, 1, 0]), a, b, b), [1, 0, 0])  # no area: an edge is left
 
 
 def test_chamfer_of_spheres():
     import trimesh
 
     sphere = trimesh.creation.icosphere(5)
-    a, _ = m.sample_surface(sphere.vertices, sphere.faces, 20_000, seed=0)
-    b, _ = m.sample_surface(sphere.vertices, sphere.faces, 20_000, seed=1)
-    same = m.chamfer(a, b)[0]
-    assert same < 0.015  # the spacing of the samples, 0.5 / sqrt(20000 / (4 pi)), is all that is left
-    mean, out, back = m.chamfer(a, 1.1 * b)
-    assert mean == pytest.approx(0.1, abs=0.003) and mean == pytest.approx((out + back) / 2)
-    assert m.chamfer(np.zeros((1, 3)), np.array([[3.0, 4, 0], [0, 0, 1]])) == (pytest.approx(2.0), pytest.approx(1.0), pytest.approx(3.0))
+    a = m.sample_surface(sphere.vertices, sphere.faces, 10_000, seed=0)
+    b = m.sample_surface(sphere.vertices, sphere.faces, 10_000, seed=1)
+    assert m.chamfer(a, b)[0] < 2e-4  # far below the spacing of the samples, .018
+    larger = m.sample_surface(1.1 * sphere.vertices, sphere.faces, 10_000, seed=2)
+    mean, out, back = m.chamfer(a, larger)
+    assert mean == pytest.approx(0.1, rel=0.01) and mean == pytest.approx((out + back) / 2)
+    half = b.only(b.points[:, 2] > 0)
+    # from latitude t of the missing half the equator is a chord of 2 sin(t / 2) away: its mean over the hemisphere, weight cos(t) dt
+    missing = 2 / 3 * (1 + np.sqrt(0.5)) - 2 * (1 - np.sqrt(0.5))
+    _, accuracy, completeness = m.chamfer(half, a)
+    assert accuracy < 2e-4 and completeness == pytest.approx(missing / 2, rel=0.03)
 
 
 def test_environment_figures():

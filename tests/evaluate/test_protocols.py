@@ -14,7 +14,7 @@ from relit.evaluate import protocols
 from relit.images import write_linear, write_srgb
 from relit.scene import Asset, Mesh
 
-SPP = 1200  # the noise of both pictures, most of it at the rims of so few pixels, must lie below 45 dB
+SPP = 1400  # the noise of both pictures, most of it at the rims of so few pixels, must lie below 45 dB
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +74,12 @@ def test_the_truth_against_itself(truth, itself):
     result = protocols.evaluate_asset(itself, truth, spp=SPP, seed=5)
     assert result["alignment"] == "identity"
     np.testing.assert_allclose(result["albedo_scale"], 1.0, atol=0.01)
-    for name in ("novel_psnr", "relit_psnr", "relit_psnr_unscaled"):
-        assert value(result, name) > 45, name
+    for name, least in (("novel_psnr", 45), ("relit_psnr", 45), ("relit_psnr_unscaled", 39)):
+        assert value(result, name) > least, name
     assert value(result, "albedo_psnr") > 38 and value(result, "normal_mae") < 1.0
     assert value(result, "roughness_mse") < 1e-6 and value(result, "mask_iou") > 0.98
     assert value(result, "environment_mse") < 1e-9 and value(result, "novel_ssim") > 0.98
-    assert value(result, "chamfer_percent") < 0.5  # the spacing of the samples is left
+    assert value(result, "chamfer_percent") < 0.01
     assert set(result["metrics"]) <= set(protocols.DEFINITIONS)
     assert all(entry["definition"] for entry in result["metrics"].values())
 

@@ -10,6 +10,8 @@ mask (truth coverage >= MASK; strict).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
@@ -95,29 +97,79 @@ def albedo_scale(predicted, truth) -> np.ndarray:
     return np.where(total > 1e-9, t.sum(0) / np.maximum(total, 1e-9), 1.0)
 
 
-def chamfer(a, b) -> tuple[float, float, float]:
-    """(mean of the two, a to b, b to a): mean distance from each point of a (N, 3) to its nearest in b (M, 3) and back, in the
-    points' unit. Not squared."""
-    to_b = float(cKDTree(b).query(a, workers=-1)[0].mean())
-    to_a = float(cKDTree(a).query(b, workers=-1)[0].mean())
-    return 0.5 * (to_a + to_b), to_b, to_a
+@dataclass(frozen=True)
+class Surface:
+    """Points on a triangle mesh. points: (N, 3) float64. triangle: (N,) the face each lies on. uniform: (N,) bool, true for samples
+    uniform by area, false for face centres, which make sure that a face between samples is found. corners: (F, 3, 3) of the faces."""
+
+    points: np.ndarray
+    triangle: np.ndarray
+    uniform: np.ndarray
+    corners: np.ndarray
+
+    def only(self, keep) -> Surface:
+        """The points where `keep` (N,) is true."""
+        return Surface(self.points[keep], self.triangle[keep], self.uniform[keep], self.corners)
 
 
-def sample_surface(vertices, faces, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """`count` points (N, 3) float64 uniform by area on a triangle mesh, and the unit face normals (N, 3) there."""
-    v, f = np.asarray(vertices, np.float64), np.asarray(faces)
-    e1, e2 = v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]
-    cross = np.cross(e1, e2)
-    area = np.linalg.norm(cross, axis=1)
+def sample_surface(vertices, faces, count: int, seed: int = 0) -> Surface:
+    """`count` points uniform by area on a triangle mesh, and the centre of every face."""
+    corners = np.asarray(vertices, np.float64)[np.asarray(faces)]
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.linalg.norm(np.cross(e1, e2), axis=1)
     rng = np.random.default_rng(seed)
     # stratified over the cumulated area: less noise in a distance between samples than independent draws
     position = (np.arange(count) + rng.random(count)) / count * area.sum()
-    index = np.minimum(np.searchsorted(np.cumsum(area), position), len(f) - 1)
+    index = np.minimum(np.searchsorted(np.cumsum(area), position), len(corners) - 1)
     u, w = rng.random(count), rng.random(count)
     flip = u + w > 1
     u, w = np.where(flip, 1 - u, u), np.where(flip, 1 - w, w)
-    points = v[f[index, 0]] + u[:, None] * e1[index] + w[:, None] * e2[index]
-    return points, cross[index] / np.maximum(area[index], 1e-30)[:, None]
+    samples = corners[index, 0] + u[:, None] * e1[index] + w[:, None] * e2[index]
+    return Surface(
+        np.concatenate([samples, corners.mean(1)]),
+        np.concatenate([index, np.arange(len(corners))]),
+        np.arange(count + len(corners)) < count,
+        corners,
+    )
+
+
+def closest_on_triangles(p, a, b, c) -> np.ndarray:
+    """Nearest points (..., 3) to p (..., 3) on the triangles a b c (each (..., 3)): the plane's foot where it lies inside, else the
+    nearest of the three edges."""
+
+    def dot(x, y):
+        return (x * y).sum(-1, keepdims=True)
+
+    def on_edge(x, y):
+        d = y - x
+        return x + np.clip(dot(p - x, d) / np.maximum(dot(d, d), 1e-30), 0, 1) * d
+
+    edges = np.stack([on_edge(a, b), on_edge(b, c), on_edge(c, a)])
+    distance = np.square(edges - p).sum(-1)
+    best = np.take_along_axis(edges, distance.argmin(0)[None, ..., None], 0)[0]
+    n = np.cross(b - a, c - a)
+    foot = p - dot(p - a, n) / np.maximum(dot(n, n), 1e-30) * n
+    sides = [dot(np.cross(y - x, foot - x), n) for x, y in ((a, b), (b, c), (c, a))]
+    inside = np.minimum(np.minimum(sides[0], sides[1]), sides[2]) >= 0
+    return np.where(inside & (dot(n, n) > 1e-30), foot, best)
+
+
+def distance_to_surface(points, surface: Surface, candidates: int = 8) -> np.ndarray:
+    """(N,) distance from points (N, 3) to the triangles under the `candidates` nearest points of a surface, in the points' unit.
+
+    Exact between the surface's points, so a mesh against itself gives nearly 0, not the spacing of samples.
+    """
+    k = min(candidates, len(surface.points))
+    near = cKDTree(surface.points).query(points, k=k, workers=-1)[1].reshape(len(points), k)
+    a, b, c = (surface.corners[surface.triangle[near], i] for i in range(3))
+    p = np.asarray(points, np.float64)[:, None]
+    return np.linalg.norm(closest_on_triangles(np.broadcast_to(p, a.shape), a, b, c) - p, axis=-1).min(1)
+
+
+def chamfer(a: Surface, b: Surface) -> tuple[float, float, float]:
+    """(mean of the two, a to b, b to a): mean distance from the samples of each surface to the other surface. Not squared."""
+    to_b, to_a = (float(distance_to_surface(x.points[x.uniform], y).mean()) for x, y in ((a, b), (b, a)))
+    return 0.5 * (to_a + to_b), to_b, to_a
 
 
 def resize_environment(environment, height: int = 256, width: int = 512) -> np.ndarray:

@@ -30,8 +30,8 @@ DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
     "relit_psnr": ("dB", f"test views under the unseen lights, mean over lights, base colour scaled ({SCALE}): {m.DEFINITIONS['psnr']}"),
     "relit_psnr_masked": ("dB", f"as relit_psnr: {m.DEFINITIONS['psnr_masked']}"),
     "relit_ssim": ("", f"as relit_psnr: {m.DEFINITIONS['ssim']}"),
-    "relit_psnr_unscaled": ("dB", "as relit_psnr, without any scale"),
-    "relit_psnr_masked_unscaled": ("dB", "as relit_psnr_masked, without any scale"),
+    "relit_psnr_unscaled": ("dB", "as relit_psnr, without any scale, rendered with a quarter of the samples"),
+    "relit_psnr_masked_unscaled": ("dB", "as relit_psnr_masked, without any scale, rendered with a quarter of the samples"),
     "albedo_psnr": (
         "dB",
         f"base colour in test views, scaled ({SCALE}), clipped to [0, 1] and sRGB-encoded, over pixels with truth coverage >= {m.MASK}; "
@@ -45,8 +45,9 @@ DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
     "mask_iou": ("", "intersection over union of predicted and true coverage >= .5, mean over test views"),
     "chamfer": (
         "world units",
-        f"mean of the two mean distances to the nearest sample, {SURFACE_SAMPLES} samples a mesh uniform by area, of which those count "
-        "that at least one camera (training or test) sees past the mesh itself: hidden inner surfaces do not count on either side",
+        f"mean of the two mean distances from samples of one surface to the triangles of the other, {SURFACE_SAMPLES} a mesh, uniform "
+        "by area, of which those count that at least one camera (training or test) sees past the mesh itself: hidden inner surfaces do not "
+        "count on either side; not squared",
     ),
     "chamfer_percent": ("% of diameter", "chamfer in per cent of the diameter of the true object's bounding sphere"),
     "chamfer_accuracy": ("world units", "the half of chamfer from the reconstruction to the truth"),
@@ -123,11 +124,12 @@ def camera_key(name: str) -> str:
     return Path(name).stem
 
 
-def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 128, seed: int = 0) -> dict[str, Any]:
+def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
     """Every figure that the truth allows, for the asset in a run or asset folder.
 
-    spp: samples a pixel of the pictures that are compared. Returns {"metrics": {name: {"value", "unit", "definition"}}, "per_view":
-    {view: {name: value}}, "albedo_scale": [r, g, b], "alignment": "identity" or "sim3"}. Call `relit.device.use_device` first.
+    spp: samples a pixel of the pictures that are compared; their noise counts as error. Returns {"metrics": {name: {"value", "unit",
+    "definition"}}, "per_view": {view: {name: value}}, "albedo_scale": [r, g, b], "alignment": "identity" or "sim3"}.
+    Call `relit.device.use_device` first.
     """
     from relit.asset.asset import load_asset
 
@@ -139,7 +141,7 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 1
     return result
 
 
-def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 128, seed: int = 0) -> dict[str, Any]:
+def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
     """As `evaluate`, for an asset in memory; all but the GLB's round trip."""
     from relit.rendering.mitsuba_scene import build_scene
 
@@ -164,11 +166,11 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 128, seed: int = 0)
     scaled = replace(asset.material, base_color=np.clip(asset.material.base_color * scale, 0, 1).astype(np.float32))
     for light_name in truth.meta["relight"]:
         light = truth.picture(f"relight/{light_name}")[..., :3]
-        for material, tail in ((scaled, ""), (asset.material, "_unscaled")):
+        for material, tail, samples in ((scaled, "", spp), (asset.material, "_unscaled", max(1, spp // 4))):
             scene = build_scene(asset.mesh, material, world_from_asset, light)
             for i, (name, camera) in enumerate(truth.test.items()):
                 reference = truth.picture(f"relight/{light_name}/{name}")
-                figures = _picture_figures("relit", scene, camera, reference, spp, seed + i)
+                figures = _picture_figures("relit", scene, camera, reference, samples, seed + i)
                 per_view[name].update({f"{key}{tail}:{light_name}": value for key, value in figures.items()})
 
     values.update(chamfer_figures(asset.mesh, world_from_asset, truth))
@@ -328,11 +330,11 @@ def chamfer_figures(mesh: Mesh, world_from_asset, truth: Truth, count: int = SUR
     true_mesh = Mesh(np.asarray(loaded.vertices, np.float32), np.asarray(loaded.faces, np.int32))
     samples = []
     for i, (each, frame) in enumerate(((mesh, world_from_asset), (true_mesh, np.eye(4)))):
-        points, _ = m.sample_surface(move_points(frame, each.vertices), each.faces, count, seed=i)
-        seen = visible(each, frame, points, cameras)
-        if not seen.any():
+        surface = m.sample_surface(move_points(frame, each.vertices), each.faces, count, seed=i)
+        seen = visible(each, frame, surface.points, cameras)
+        if not (seen & surface.uniform).any():
             raise UserError("no part of the mesh can be seen by any camera", "it lies elsewhere than the cameras look, or is empty")
-        samples.append(points[seen])
+        samples.append(surface.only(seen))
     mean, accuracy, completeness = m.chamfer(*samples)
     return {
         "chamfer": mean,
