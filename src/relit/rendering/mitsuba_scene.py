@@ -133,6 +133,11 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
     return Scene(mi.load_dict(scene), t, unit_from_world, SmoothOrigins(unit) if bsdf == "relit" else None)
 
 
+def build_geometry(mesh: Mesh):
+    """A Mitsuba scene of the mesh alone, in its own frame, for ray queries (no material, no light)."""
+    return mi.load_dict({"type": "scene", "object": _shape(mesh, mi.load_dict({"type": "diffuse"}), False)})
+
+
 def _camera_rays(scene: Scene, camera: Camera, sampler, count: int):
     """`count` rays (sample-major: pixel = index mod W * H) through uniformly jittered positions (a box filter), in the unit frame;
     also the cosine to the optical axis, which turns distance into depth."""
@@ -178,7 +183,7 @@ def render(scene: Scene, camera: Camera, *, spp: int, seed: int = 0, max_depth: 
             if scene.origins is None:
                 color, hit, _ = path.sample(scene.mi_scene, sampler, ray)
             else:
-                color, hit = trace(scene.mi_scene, scene.origins, sampler, mi.Ray3f(ray), depth)
+                color, hit = trace(scene.mi_scene, scene.mi_scene.shapes()[0].bsdf(), scene.origins, sampler, mi.Ray3f(ray), depth)
             rgba = [*color, dr.select(hit, mi.Float(1), 0)]
             dr.eval(rgba)
             for c in range(4):

@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.materials import brdf
+from relit.rendering.bsdf import shading_normal
 from relit.scene import Mesh
 
 MAX_SHIFT = 0.05  # of the triangle's longest edge; a sphere of 30 facets round needs .025, a cube with averaged normals would want .25
@@ -48,12 +50,12 @@ def _balance(a, b):
 
 
 @dr.syntax
-def trace(scene, origins, sampler, ray, max_depth):
+def trace(scene, bsdf, origins, sampler, ray, max_depth):
     """Radiance (Color3f) along `ray` and whether it meets the object (Bool). The light is not seen by the camera.
 
+    bsdf: the object's, from `rendering.bsdf`; called without Mitsuba's dispatch, so that its textures are looked up once a bounce.
     max_depth: longest path in edges, as Mitsuba counts (2 = direct light only); mi.UInt32, opaque.
     """
-    ctx = mi.BSDFContext()
     L = mi.Color3f(0)  # radiance so far
     beta = mi.Color3f(1)  # path throughput
     depth = mi.UInt32(0)
@@ -76,18 +78,20 @@ def trace(scene, origins, sampler, ray, max_depth):
         # ---- light sampled directly
         go_on = valid & (depth + 1 < max_depth)
         si.p = dr.select(go_on, origins.shifted(si, pi.prim_uv, go_on), si.p)
-        bsdf = si.bsdf(ray)
+        m, n = bsdf.surface(si, go_on), shading_normal(si, bsdf.normalmap, go_on)
         ds, light = scene.sample_emitter_direction(si, sampler.next_2d(), True, go_on)
         lit = go_on & (ds.pdf > 0)
-        value, bsdf_pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), lit)
-        L += dr.select(lit, beta * value * light * _balance(ds.pdf, bsdf_pdf), 0)
+        wl = si.to_local(ds.d)
+        L += dr.select(lit, beta * brdf.evaluate(m, n, si.wi, wl) * light * _balance(ds.pdf, brdf.pdf(m, n, si.wi, wl)), 0)
 
         # ---- the next direction
-        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), go_on)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        beta *= weight
+        wo = brdf.sample(m, n, si.wi, sampler.next_1d(), sampler.next_2d())
+        pdf = brdf.pdf(m, n, si.wi, wo)
+        go_on &= pdf > 0
+        beta *= dr.select(go_on, brdf.evaluate(m, n, si.wi, wo) / dr.select(go_on, pdf, 1), 0)
+        ray = si.spawn_ray(si.to_world(wo))
         previous = mi.Interaction3f(si)
-        previous_pdf = bs.pdf
+        previous_pdf = pdf
         depth += 1
         active = go_on & (dr.max(beta) > 0)
     return L, hit
