@@ -53,18 +53,20 @@ def reconstruct(
     record = {"input": Path(input).resolve().name, **dataclasses.asdict(job), "capture": kind, "settings": dataclasses.asdict(options)}
     with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
         asset_folder = run.folder / "asset"
-        if run.done("asset"):
+        finished = run.done("asset") and (asset_folder / "asset.json").is_file()
+        reported = run.done("report") and (run.folder / "report.html").is_file()
+        if finished and reported:
             run.say(f"this run is complete: {asset_folder}")
-        else:
-            _begin(run, capture, chosen, cost)
-            capture = with_cameras(capture, run, job)
+            return asset_folder
+        _begin(run, capture, chosen, cost)
+        capture = with_cameras(capture, run, job)
+        if not finished:
             _save(run, fit(capture, run, options, job.seed), capture, kind, job, chosen)
-        if not run.done("report"):
-            from relit.evaluate.report import write_report
+        from relit.evaluate.report import write_report
 
-            with run.stage("report", title="report"):
-                write_report(run.folder, capture)
-            run.say(f"report: {run.folder / 'report.html'}")
+        with run.stage("report", title="report"):
+            write_report(run.folder, capture)
+        run.say(f"report: {run.folder / 'report.html'}")
         return asset_folder
 
 

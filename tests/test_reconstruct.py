@@ -1,0 +1,134 @@
+"""The main job around the fit: resuming, repeating, refusing; the fit itself is replaced by one that hands the truth back."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_faults import picture, write_capture
+
+from relit import cli
+from relit.asset.asset import load_asset
+from relit.capture.procedural import pawn, studio
+from relit.evaluate import report
+from relit.files import parse_toml
+from relit.plan import Job, check_memory, estimate, open_input
+from relit.scene import Asset
+
+CALLS: list[tuple] = []
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """A fit of three steps that checkpoints each, and a small report."""
+    import relit.fit.multiview as multiview
+
+    for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1}.items():
+        monkeypatch.setattr(report, name, value)
+    CALLS.clear()
+
+    def fit(capture, run, options, seed):
+        mesh, material = pawn(10, 14, 16)
+        if not run.done("volume"):
+            with run.stage("volume", steps=3) as stage:
+                first = int((stage.load("state") or {"i": 0})["i"])
+                CALLS.append(("fit", first, len(capture.photos), seed))
+                for i in range(first, 3):
+                    stage.step(i + 1, loss=1.0)
+                    stage.save("state", i=i + 1)
+                    if STOP and i == 1:
+                        raise STOP.pop()
+        return Asset(mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos))
+
+    monkeypatch.setattr(multiview, "reconstruct", fit)
+
+
+STOP: list[BaseException] = []
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return write_capture(tmp_path / "photos")
+
+
+def relit(capsys, *argv):
+    code = cli.main([str(a) for a in argv])
+    out = capsys.readouterr()
+    return code, out.out, out.err
+
+
+def test_a_stopped_job_resumes_and_a_finished_one_is_left(capsys, tmp_path, capture):
+    command = ("reconstruct", capture, "-o", tmp_path / "run", "--quality", "draft", "--seed", "3")
+    STOP.append(KeyboardInterrupt())
+    code, _, err = relit(capsys, *command)
+    assert code == 130 and "goes on from the checkpoint" in err
+    assert not (tmp_path / "run/asset").exists()
+    code, out, _ = relit(capsys, *command)
+    assert code == 0 and out.strip() == str(tmp_path / "run/asset/object.glb")
+    assert CALLS == [("fit", 0, 6, 3), ("fit", 2, 6, 3)]
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*") if p.is_file() and p.name not in ("lock", "log.txt")}
+    code, _, err = relit(capsys, *command)
+    assert code == 0 and "this run is complete" in err and len(CALLS) == 2
+    assert before == {p: p.stat().st_mtime_ns for p in before}
+    (tmp_path / "run/report.html").unlink()
+    assert relit(capsys, *command)[0] == 0 and (tmp_path / "run/report.html").exists() and len(CALLS) == 2
+
+
+def test_the_asset_says_how_it_was_made_and_holds_no_path(capsys, tmp_path, capture):
+    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--seed", "5")[0] == 0
+    meta = load_asset(tmp_path / "run").meta
+    assert meta["capture"] == "multiview" and meta["seed"] == 5 and meta["quality"] == "standard" and meta["device"] in ("cpu", "cuda")
+    assert meta["stages"]["volume"]["peak_memory"] > 1e7 and "images/p0.png" in meta["inputs"] and "mitsuba" in meta["versions"]
+    for path in (tmp_path / "run").rglob("*"):
+        if path.is_file() and path.suffix in (".toml", ".json", ".jsonl", ".html"):
+            assert str(tmp_path) not in path.read_text(), path
+    config = parse_toml((tmp_path / "run/config.toml").read_text())
+    assert config["input"] == "photos" and config["seed"] == 5 and isinstance(config["settings"], dict)
+
+
+def test_a_runs_config_repeats_it(capsys, tmp_path, capture):
+    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "a", "--quality", "draft", "--max-side", "40", "--seed", "7")[0] == 0
+    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "b", "--config", tmp_path / "a/config.toml")[0] == 0
+    assert (tmp_path / "a/config.toml").read_text() == (tmp_path / "b/config.toml").read_text()
+    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "c", "--config", tmp_path / "a/config.toml", "--seed", "8")[0] == 0
+    assert parse_toml((tmp_path / "c/config.toml").read_text())["seed"] == 8
+
+
+def test_other_settings_and_replaced_photos_are_refused(capsys, tmp_path, capture):
+    run = tmp_path / "run"
+    assert relit(capsys, "reconstruct", capture, "-o", run, "--quality", "draft")[0] == 0
+    code, _, err = relit(capsys, "reconstruct", capture, "-o", run, "--quality", "high")
+    assert code == 2 and "quality was 'draft', is now 'high'" in err
+    Image.fromarray(255 - picture(2)).save(capture / "images/p2.png")
+    code, _, err = relit(capsys, "reconstruct", capture, "-o", run, "--quality", "draft")
+    assert code == 3 and "images/p2.png" in err and len(CALLS) == 1
+    Image.fromarray(picture(2)).save(capture / "images/p2.png")
+    assert relit(capsys, "reconstruct", capture, "-o", run, "--quality", "high", "--overwrite")[0] == 0
+    assert len(CALLS) == 2
+
+
+def test_a_failed_fit_leaves_no_asset_and_its_log(capsys, tmp_path, capture):
+    STOP.append(ZeroDivisionError("the fit"))
+    code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
+    assert code == 1 and "Traceback" not in err and str(tmp_path / "run/log.txt") in err
+    assert "ZeroDivisionError: the fit" in (tmp_path / "run/log.txt").read_text()
+    assert not (tmp_path / "run/asset").exists()
+
+
+def test_estimate_grows_with_photos_and_quality(capture, monkeypatch):
+    few = open_input(capture, Job())
+    draft, high = (estimate(few, Job(quality=q)) for q in ("draft", "high"))
+    assert draft.seconds < high.seconds and draft.memory < high.memory
+    small = estimate(open_input(capture, Job(max_side=24)), Job(quality="draft"))
+    assert small.memory < draft.memory
+    check_memory(draft, "cpu")
+
+
+def test_inspect_changes_nothing(capsys, capture):
+    before = sorted(capture.rglob("*"))
+    code, out, _ = relit(capsys, "inspect", capture, "--json", "--quality", "high")
+    found = json.loads(out)
+    assert code == 0 and found["stages"] == ["volume", "surface", "asset", "report"] and found["estimate"]["quality"] == "high"
+    assert before == sorted(capture.rglob("*"))
