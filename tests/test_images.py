@@ -1,5 +1,7 @@
 """Pictures survive a round trip; damaged ones get an answer."""
 
+import sys
+
 import numpy as np
 import pytest
 from PIL import Image as PilImage
@@ -78,6 +80,8 @@ def test_exif_orientation_is_applied_once(tmp_path, orientation):
     image, header = images.read_image(tmp_path / "a.jpg"), images.read_header(tmp_path / "a.jpg")
     assert image.rgb.shape == (24, 16, 3) and (header.width, header.height) == (16, 24)
     assert image.rgb[3, 3, 0] > 0.9 and image.rgb[20, 12, 0] < 0.1 and image.rgb[3, 12, 0] < 0.1 and image.rgb[20, 3, 0] < 0.1
+    np.testing.assert_allclose(images.read_small(tmp_path / "a.jpg", 64).rgb, image.rgb, atol=0.02)
+    assert images.read_image(tmp_path / "a.jpg", upright=False).rgb.shape == (*stored.shape[:2], 3)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -126,6 +130,29 @@ def test_missing_unknown_and_oversized_files(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "MAX_PIXELS", 10)
     with pytest.raises(UserError, match="too large: 8 x 6"):
         images.read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("name, module, extra", [("a.heic", "pillow_heif", "relit[heic]"), ("a.nef", "rawpy", "relit[raw]")])
+def test_optional_formats_say_what_to_install(tmp_path, monkeypatch, name, module, extra):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_bytes(b"x" * 64)
+    for read in (images.read_image, images.read_header):
+        with pytest.raises(UserError, match="need an optional package") as caught:
+            read(tmp_path / name)
+        assert extra in caught.value.fix
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr"])
+def test_small_copies_agree_with_the_whole_picture(tmp_path, suffix):
+    import cv2
+
+    y, x = np.mgrid[:96, :128]
+    array = np.stack([x / 128, y / 96, 0.5 + 0 * x], -1).astype(np.float32)
+    (images.write_linear if suffix == ".exr" else images.write_srgb)(tmp_path / f"a{suffix}", array)
+    small = images.read_small(tmp_path / f"a{suffix}", 32)
+    assert max(small.rgb.shape) <= 64 and small.alpha is None
+    h, w = small.rgb.shape[:2]
+    np.testing.assert_allclose(small.rgb, cv2.resize(array, (w, h), interpolation=cv2.INTER_AREA), atol=0.03)
 
 
 def test_layers_of_an_exr(tmp_path):

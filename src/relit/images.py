@@ -84,7 +84,7 @@ def read_image(path: str | Path, upright: bool = True) -> Image:
     return Image(np.ascontiguousarray(rgb), alpha, clipped)
 
 
-def read_small(path: str | Path, side: int = 256) -> Image:
+def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image:
     """A small version of `read_image` (longest side about `side` pixels) for looking at many photos quickly; linear, upright.
 
     JPEG files are decoded at reduced size. Alpha is kept apart: rgb is NOT composited. `clipped` is None.
@@ -94,7 +94,7 @@ def read_small(path: str | Path, side: int = 256) -> Image:
     path = Path(path)
     suffix = _checked(path)
     if suffix in FLOAT | RAW:
-        image = read_image(path)
+        image = read_image(path, upright)
         h, w = image.rgb.shape[:2]
         size = (max(1, round(w * side / max(w, h))), max(1, round(h * side / max(w, h)))) if max(w, h) > side else (w, h)
         alpha = None if image.alpha is None else cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA)
@@ -106,7 +106,8 @@ def read_small(path: str | Path, side: int = 256) -> Image:
             if image.mode.startswith("I"):
                 codes = read_data(path)
                 image = PilImage.fromarray(_codes(codes))
-            small = ImageOps.exif_transpose(image.convert("RGBA" if has_alpha else "RGB"))
+            small = image.convert("RGBA" if has_alpha else "RGB")
+            small = ImageOps.exif_transpose(small) if upright else small
             small = small.reduce(max(1, max(small.size) // side)) if max(small.size) >= 2 * side else small
             array = _unit(np.array(small))
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:

@@ -229,6 +229,22 @@ def test_a_fisheye_of_nerfstudio_is_undistorted(tmp_path, cameras):
     assert (photo.width, photo.height) != (72, 56)
 
 
+def test_cameras_of_photos_as_stored_before_exif_turned_them(tmp_path, cameras):
+    """COLMAP and others may calibrate the pixels as stored; the camera's shape tells."""
+    from PIL import Image as PilImage
+
+    (tmp_path / "images").mkdir()
+    exif = PilImage.Exif()
+    exif[0x0112] = 6
+    for i, camera in enumerate(cameras):
+        data = shots.images.encode_png(shots.picture(camera)[0])
+        (tmp_path / "x.png").write_bytes(data)
+        PilImage.open(tmp_path / "x.png").save(tmp_path / "images" / f"{i}.jpg", exif=exif, quality=97, subsampling=0)
+    (tmp_path / "x.png").unlink()
+    shots.write_transforms(tmp_path, cameras, [f"images/{i}.jpg" for i in range(6)])
+    check(open_capture(tmp_path), cameras, "transforms")
+
+
 def test_normal_priors_from_files(tmp_path, cameras):
     names = shots.write_photos(tmp_path / "images", cameras)
     shots.write_transforms(tmp_path, cameras, [f"images/{n}" for n in names])

@@ -13,7 +13,7 @@ from relit.capture import colmap_model, idr, llff, middlebury, photo, transforms
 from relit.capture.frames import Frame, Reading
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
 from relit.errors import UserError, did_you_mean
-from relit.images import Header, read_small
+from relit.images import Header, Image, read_small
 from relit.masks.files import find_mask, index_masks, judge, read_mask
 from relit.masks.grabcut import grabcut
 from relit.masks.segment import segmenter
@@ -78,12 +78,7 @@ def open_capture(
             notes.append(f"the object sphere was found from {source}")
         notes += check_sphere(sphere, cameras)
         up = up_direction(cameras)
-        if masks == "grabcut":
-            photos = [_cut(p, sphere) for p in photos]
-            notes.append("masks were guessed by GrabCut from the object sphere; look at them")
-    elif masks == "grabcut":
-        raise UserError("GrabCut needs cameras", "it is seeded by the object sphere", "find the cameras first, or give mask files")
-    return Capture(
+    capture = Capture(
         root=reading.root,
         format=reading.format,
         photos=tuple(photos[i] for i in train),
@@ -94,6 +89,22 @@ def open_capture(
         black_background=dark,
         notes=tuple(notes),
     )
+    if masks == "grabcut" and not capture.has_cameras:
+        return replace(capture, notes=(*capture.notes, "GrabCut is seeded by the object sphere: it waits until the cameras are found"))
+    return with_grabcut(capture) if masks == "grabcut" else capture
+
+
+def with_grabcut(capture: Capture) -> Capture:
+    """The capture with masks that GrabCut guesses from the object sphere, for photos with cameras. Decodes every photo once."""
+
+    def cut(p: Photo) -> Photo:
+        return photo.with_mask(p, grabcut(p.load().rgb, p.camera, capture.sphere))
+
+    if capture.sphere is None or not capture.has_cameras:
+        raise UserError("GrabCut needs cameras", "it is seeded by the object sphere", "find the cameras first, or give mask files")
+    note = "masks were guessed by GrabCut from the object sphere; look at them"
+    photos, held = (tuple(cut(p) for p in some) for some in (capture.photos, capture.held_out))
+    return replace(capture, photos=photos, held_out=held, notes=(*capture.notes, note))
 
 
 def with_calibration(p: Photo, frame: Frame) -> Photo:
@@ -141,7 +152,7 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
     """-> (photos that know their masks, small masks (h, w) or None, True when the background is black)."""
     none = [None] * len(photos)
     if wanted in ("auto", "alpha") and all(h.alpha for h in headers):
-        small = [read_small(f.path, SMALL).alpha for f in reading.frames]
+        small = [_small(p).alpha for p in photos]
         if wanted == "alpha" or any((a < 0.5).any() for a in small):
             _, empty = judge({f.name: a for f, a in zip(reading.frames, small, strict=True)}, "the alpha channel")
             _say_empty(empty, notes)
@@ -170,6 +181,10 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
     return photos, none, False
 
 
+def _small(p: Photo) -> Image:
+    return read_small(p.load.path, SMALL, p.load.upright)
+
+
 def _with(p: Photo, **changes) -> Photo:
     return replace(p, load=replace(p.load, **changes))
 
@@ -193,7 +208,7 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
             f"masks were looked for in {folder.name}/ by the photos' names"
             if folder
             else "no mask folder was found and no file ends in _mask.png",
-            f"add the masks, or use --set masks=none: {folder or reading.root}",
+            f"add the masks, or use --masks none: {folder or reading.root}",
         )
     small = [None if m is None or not m.is_file() else _shrunk(read_mask(m)) for m in files]
     where = f"{folder.name}/" if folder else "the mask files"
@@ -219,17 +234,17 @@ def _shrunk(mask: np.ndarray) -> np.ndarray:
 
 def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
     step = max(1, len(photos) // LOOKED_AT)
-    looked = [read_small(f.path, SMALL).rgb for f in reading.frames[::step]]
+    looked = [_small(p).rgb for p in photos[::step]]
     backdrop: Backdrop | None = find_backdrop(looked)
     if backdrop is None:
         if asked:
             raise UserError(
                 "the photos do not stand before a plain backdrop",
                 "their borders are not of one colour",
-                "give mask files, or use --set masks=none to fit the background as well",
+                "give mask files, or use --masks none to fit the background as well",
             )
         return None
-    small = [backdrop(read_small(f.path, SMALL).rgb) for f in reading.frames]
+    small = [backdrop(_small(p).rgb) for p in photos]
     _, empty = judge({f.name: m for f, m in zip(reading.frames, small, strict=True)}, "the threshold")
     _say_empty(empty, notes)
     kind = "dark" if backdrop.dark else "plain"
@@ -238,7 +253,3 @@ def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: li
         + ("; what lies outside them is set to black" if backdrop.dark else "")
     )
     return [_with(p, mask=backdrop) for p in photos], small, backdrop.dark
-
-
-def _cut(p: Photo, sphere: Sphere) -> Photo:
-    return photo.with_mask(p, grabcut(p.load().rgb, p.camera, sphere))

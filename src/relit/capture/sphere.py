@@ -88,7 +88,7 @@ def _seen(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
             f"the cameras look away from each other: only {seen.sum()} of {len(seen)} see the point that their axes approach most",
             "the poses use other axes than the format says (camera_from_world instead of world_from_camera, or y and z flipped), "
             "or the photos do not go around one object",
-            "check one pose by hand, or give the object sphere",
+            "check one pose by hand, or give the object sphere (--sphere X Y Z RADIUS)",
         )
     return seen
 
@@ -142,7 +142,7 @@ def sphere_from_masks(views: list[View]) -> Sphere:
         raise UserError(
             "the masks of different photos have no place in common",
             "masks and cameras do not belong together, the poses use other axes than the format says, or the masks show different things",
-            "check one pose and one mask by hand, or give the object sphere",
+            "check one pose and one mask by hand, or give the object sphere (--sphere X Y Z RADIUS)",
         )
     centre, reach = smallest_ball(kept)
     return Sphere(centre, (reach + 0.5 * float(np.linalg.norm(cell))) / FILL)

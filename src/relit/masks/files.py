@@ -107,13 +107,13 @@ def judge(masks: dict[str, np.ndarray], source: str) -> tuple[bool, list[str]]:
         raise UserError(
             "all masks are black",
             f"{source} marks no pixel of any photo as the object",
-            "write white on the object, or use --set masks=none",
+            "write white on the object, or use --masks none",
         )
     if len(full) == len(masks):
         raise UserError(
             "all masks are white",
             f"{source} marks every pixel of every photo as the object",
-            "write black off the object, or use --set masks=none",
+            "write black off the object, or use --masks none",
         )
     rest = {n: m for n, m in masks.items() if n not in empty and n not in full}
     inverted = [n for n, m in rest.items() if looks_inverted(m)]

@@ -16,7 +16,7 @@ def segmenter(model: str = "u2net"):
         raise UserError(
             "masks by segmentation need an optional package",
             "rembg or onnxruntime is not installed",
-            "pip install 'relit[segment]', or give mask files, or use --set masks=grabcut",
+            "pip install 'relit[segment]', or give mask files, or use --masks grabcut",
             code=EXIT_ENVIRONMENT,
         ) from error
     try:
