@@ -261,3 +261,15 @@ def test_an_atlas_holds_repeated_textures(tmp_path, mesh, material):
     assert np.abs(look(atlas.roughness, merged.uvs[:n]) - look(t.roughness, uvs))[off_seam].max() < 0.08
     inside = (mesh.uvs.min(1) > 0.05) & (mesh.uvs.max(1) < 0.95)
     assert np.abs(look(atlas.base_color, merged.uvs[n:]) - look(other.base_color, mesh.uvs))[inside].max() < 0.08
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value"), [("accessors", "byteOffset", -8), ("bufferViews", "byteOffset", -8), ("bufferViews", "byteLength", 1 << 30)]
+)
+def test_nothing_outside_the_file_is_read(tmp_path, mesh, material, part, key, value):
+    write_glb(tmp_path / "a.glb", mesh, material)
+    doc, blob = parse(tmp_path / "a.glb")
+    doc[part][0][key] = value
+    (tmp_path / "b.glb").write_bytes(assemble(doc, blob))
+    with pytest.raises(UserError, match="damaged"):
+        read_asset_file(tmp_path / "b.glb")

@@ -33,7 +33,8 @@ def read_asset_file(path: str | Path) -> tuple[Mesh, Material]:
         raise UserError("the model file does not exist", fix=f"check the path: {path}")
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
-        return read_gltf(path)
+        with np.errstate(all="ignore"):  # damaged files: values that are not finite are refused at the end
+            return read_gltf(path)
     if suffix == ".obj":
         return read_obj(path)
     raise UserError(f"'{suffix}' is not a model format that can be read", fix=f"use .glb, .gltf or .obj: {path}")

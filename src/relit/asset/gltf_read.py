@@ -72,8 +72,10 @@ class _File:
         if b not in self.buffers:
             uri = self.json["buffers"][b].get("uri")
             self.buffers[b] = self.resource(uri) if uri else (self.chunk or b"")
-        start = v.get("byteOffset", 0)
-        return self.buffers[b][start : start + v["byteLength"]], v.get("byteStride", 0)
+        start, length, stride = v.get("byteOffset", 0), v["byteLength"], v.get("byteStride", 0)
+        if not (start >= 0 and length >= 0 and 0 <= stride <= 252 and start + length <= len(self.buffers[b])):
+            raise ValueError("a buffer view lies outside its buffer")
+        return self.buffers[b][start : start + length], stride
 
     def accessor(self, index: int) -> np.ndarray:
         """(count, width) array; normalised integers become floats."""
@@ -84,8 +86,11 @@ class _File:
         if "bufferView" not in a:
             return np.zeros((a["count"], width), dtype)
         data, stride = self.view(a["bufferView"])
-        item = dtype.itemsize * width
-        out = np.ndarray((a["count"], width), dtype, data, a.get("byteOffset", 0), (stride or item, dtype.itemsize))
+        item, start, count = dtype.itemsize * width, a.get("byteOffset", 0), a["count"]
+        stride = stride or item
+        if not (count > 0 and start >= 0 and start + stride * (count - 1) + item <= len(data)):
+            raise ValueError("an accessor lies outside its buffer view")
+        out = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
         if a.get("normalized") and dtype.kind in "iu":
             return np.maximum(out.astype(np.float32) / np.iinfo(dtype).max, -1.0)
         return out
@@ -205,7 +210,7 @@ def _parts(file: _File, primitive: dict, asset_from_node: np.ndarray, materials:
         faces = file.accessor(primitive["indices"]).astype(np.int32).reshape(-1, 3)
     else:
         faces = np.arange(len(v), dtype=np.int32).reshape(-1, 3)
-    if len(faces) and faces.max() >= len(v):
+    if len(faces) and (faces.max() >= len(v) or faces.min() < 0):
         raise UserError("the model's triangles refer to vertices that are not there", fix=f"export it again: {file.path}")
     key = primitive.get("material")
     if key not in materials:
