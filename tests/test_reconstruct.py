@@ -132,3 +132,14 @@ def test_inspect_changes_nothing(capsys, capture):
     found = json.loads(out)
     assert code == 0 and found["stages"] == ["volume", "surface", "asset", "report"] and found["estimate"]["quality"] == "high"
     assert before == sorted(capture.rglob("*"))
+
+
+def test_inspect_draws_the_cameras(capsys, tmp_path, capture):
+    plot = tmp_path / "cameras.svg"
+    assert relit(capsys, "inspect", capture, "--plot", plot)[0] == 0
+    assert plot.read_text().startswith("<svg xmlns") and plot.read_text().count("<line") == 12
+    code, _, err = relit(capsys, "inspect", capture, "--plot", plot)
+    assert code == 3 and "nothing was overwritten" in err
+    (capture / "transforms.json").unlink()
+    code, _, err = relit(capsys, "inspect", capture, "--plot", tmp_path / "other.svg")
+    assert code == 3 and "not known yet" in err and not (tmp_path / "other.svg").exists()

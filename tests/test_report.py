@@ -17,7 +17,7 @@ from relit.cameras.se3 import look_at
 from relit.capture.procedural import evening, pawn, studio
 from relit.conventions import environment_directions, environment_solid_angles
 from relit.evaluate import report
-from relit.evaluate.curves import bars, camera_plot, curve
+from relit.evaluate.curves import ball_of, bars, camera_plot, curve
 from relit.run import Run
 from relit.scene import Asset, Camera, Capture, Photo, Pixels
 
@@ -140,8 +140,13 @@ def test_curves():
     assert bars([("a", 0.0)]).count("<rect") == 1
 
 
-def test_camera_plot_has_every_camera_twice(asset):
-    assert camera_plot(asset).count("<line") == 2 * len(asset.cameras)
+def test_camera_plot_shows_every_camera_on_both_sides(asset):
+    ball = ball_of(asset)
+    vertices = asset.mesh.vertices @ asset.world_from_asset[:3, :3].T + asset.world_from_asset[:3, 3]
+    assert np.linalg.norm(vertices @ ball[:3, :3].T + ball[:3, 3], axis=1).max() == pytest.approx(1, abs=1e-5)
+    plot = camera_plot([c for _, c in asset.cameras], ball)
+    assert plot.count("<line") == 2 * len(asset.cameras) and plot.count("<svg") == 1
+    assert camera_plot([], ball) == ""
 
 
 # ---------------------------------------------------------------- the demo's object and lights

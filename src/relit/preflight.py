@@ -1,4 +1,4 @@
-"""What an input was recognised as, and what a reconstruction of it would take. `relit inspect`: renders nothing, writes nothing."""
+"""What an input was recognised as, and what a reconstruction of it would take. `relit inspect`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from relit.errors import UserError
+from relit.files import write_text
 from relit.log import readable_bytes, readable_seconds
 from relit.plan import Job, estimate, open_input
 from relit.scene import Capture
 
 
-def inspect(input: str | Path, *, quality: str = "standard", masks: str = "auto", sphere=None, max_side: int | None = None) -> dict:
-    """What the input was recognised as, what stands in it, and what a reconstruction would take. Renders nothing, writes nothing."""
-    job = Job(quality=quality, masks=masks, sphere=sphere, max_side=max_side)
+def inspect(input: str | Path, job: Job, plot: Path | None = None) -> dict:
+    """What the input was recognised as, what stands in it, and what a reconstruction would take. plot: an SVG file for the cameras."""
     capture = open_input(Path(input), job)
+    if plot is not None:
+        write_plot(plot, capture)
     cost = estimate(capture, job)
     sizes = sorted({(p.width, p.height) for p in capture.photos})
     ball = capture.sphere and {"centre": [float(x) for x in capture.sphere.centre], "radius": float(capture.sphere.radius)}
@@ -30,8 +33,30 @@ def inspect(input: str | Path, *, quality: str = "standard", masks: str = "auto"
         "light": "one fixed light is assumed (multiview)",
         "notes": list(capture.notes),
         "stages": ([] if capture.has_cameras else ["cameras"]) + ["volume", "surface", "asset", "report"],
-        "estimate": {"seconds": round(cost.seconds), "memory": round(cost.memory), "disk": round(cost.disk), "quality": quality},
+        "estimate": {"seconds": round(cost.seconds), "memory": round(cost.memory), "disk": round(cost.disk), "quality": job.quality},
     }
+
+
+def write_plot(path: Path, capture: Capture) -> None:
+    """An SVG file of the cameras around the object sphere, from above and from the side. Raises UserError when either is not known."""
+    if not capture.has_cameras or capture.sphere is None:
+        what = "there is nothing to plot: the cameras are not known yet"
+        raise UserError(what, "they are found by the reconstruction", "relit reconstruct, then see its report")
+    from relit.evaluate.curves import camera_plot
+
+    plot = camera_plot([p.camera for p in capture.photos], _upright(capture) @ np.linalg.inv(capture.sphere.world_from_unit))
+    write_text(path, plot.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" style="background:#fff" ', 1))
+
+
+def _upright(capture: Capture) -> np.ndarray:
+    """(4, 4) rotation that turns the capture's up to +Y."""
+    out = np.eye(4)
+    if capture.up is not None:
+        y = np.asarray(capture.up, np.float64) / np.linalg.norm(capture.up)
+        x = np.cross(y, np.eye(3)[np.argmin(np.abs(y))])
+        x /= np.linalg.norm(x)
+        out[:3, :3] = np.stack([x, y, np.cross(x, y)])
+    return out
 
 
 def mask_coverage(capture: Capture, views: int = 4) -> dict | None:

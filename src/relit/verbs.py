@@ -154,13 +154,18 @@ def _inspect_flags(parser: Parser) -> None:
     _path_in(parser, "input", "folder of photos, transforms.json, COLMAP model, ...")
     parser.common.add_argument("--json", action="store_true", help="print JSON")
     parser.common.add_argument("--quality", choices=QUALITIES, default="standard", help="for the estimate of time and memory")
+    parser.common.add_argument("--plot", type=Path, default=None, metavar="FILE.svg", help="draw the cameras around the object sphere")
     _opening(parser)
 
 
 def _inspect(args) -> None:
+    from relit.plan import Job
     from relit.preflight import as_text, inspect
 
-    found = inspect(args.input, quality=args.quality, masks=args.masks or "auto", sphere=args.sphere, max_side=args.max_side)
+    if args.plot is not None:
+        _free(args.plot, overwrite=False)
+    job = Job(quality=args.quality, masks=args.masks or "auto", sphere=args.sphere, max_side=args.max_side)
+    found = inspect(args.input, job, args.plot)
     print(json.dumps(found, indent=2) if args.json else as_text(found))
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
 
-from relit.conventions import move_points
-from relit.scene import Asset
+from relit.conventions import move_points, similarity
+from relit.scene import Asset, Camera
 
 WIDTH, HEIGHT, MARGIN = 360, 160, 28
+PLANE = 300  # a side of the camera plot
 
 
 def curve(title: str, points: list[tuple[float, float]]) -> str:
@@ -43,35 +45,40 @@ def bars(rows: list[tuple[str, float]]) -> str:
     return _svg(WIDTH, 22 * len(rows) + 12, "".join(parts))
 
 
-def camera_plot(asset: Asset) -> str:
-    """Cameras around the object's bounding sphere, from above (asset's X and Z) and from the side (X and Y)."""
-    if not asset.cameras:
-        return ""
+def ball_of(asset: Asset) -> np.ndarray:
+    """(4, 4) ball_from_world: the asset's bounding sphere becomes the unit ball at the origin, +Y up as in the GLB."""
     low, high = asset.mesh.vertices.min(0), asset.mesh.vertices.max(0)
     centre = 0.5 * (low + high)
     radius = float(np.linalg.norm(asset.mesh.vertices - centre, axis=1).max())
-    asset_from_world = np.linalg.inv(asset.world_from_asset)
-    eyes = move_points(asset_from_world, np.array([c.centre for _, c in asset.cameras])) - centre
-    axes = np.array([np.asarray(c.world_from_camera)[:3, 2] for _, c in asset.cameras]) @ asset_from_world[:3, :3].T
+    return similarity(np.eye(3), -centre / radius, 1 / radius) @ np.linalg.inv(asset.world_from_asset)
+
+
+def camera_plot(cameras: Sequence[Camera], ball_from_world: np.ndarray) -> str:
+    """Cameras around the unit ball that holds the object, from above (X and Z) and from the side (X and Y, +Y up). One SVG."""
+    if not cameras:
+        return ""
+    eyes = move_points(ball_from_world, np.array([c.centre for c in cameras]))
+    axes = np.array([np.asarray(c.world_from_camera)[:3, 2] for c in cameras]) @ np.asarray(ball_from_world)[:3, :3].T
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    reach = max(float(np.abs(eyes).max()) * 1.1, radius * 1.1)
-    above, side = (_plane(eyes, axes, radius, reach, *view) for view in (((0, 2), "from above"), ((0, 1), "from the side")))
-    return f"<div class=row>{above}{side}</div>"
+    reach = 1.1 * max(float(np.abs(eyes).max()), 1.0)
+    above = _plane(eyes, axes, reach, (0, 2), f"{len(cameras)} cameras from above")
+    side = _plane(eyes, axes, reach, (0, 1), "from the side")
+    return _svg(2 * PLANE, PLANE, f'{above}<g transform="translate({PLANE} 0)">{side}</g>')
 
 
-def _plane(eyes, axes, radius: float, reach: float, pair: tuple[int, int], name: str) -> str:
-    side = 300
+def _plane(eyes, axes, reach: float, pair: tuple[int, int], name: str) -> str:
+    middle = PLANE / 2
     sign = 1 if pair[1] == 2 else -1  # pictures grow downwards: +Z towards the reader's bottom, +Y up
 
     def place(p):
-        return side / 2 * (1 + p[pair[0]] / reach), side / 2 * (1 + sign * p[pair[1]] / reach)
+        return middle * (1 + p[pair[0]] / reach), middle * (1 + sign * p[pair[1]] / reach)
 
-    parts = [f'<circle cx="{side / 2}" cy="{side / 2}" r="{side / 2 * radius / reach:.1f}" fill="#dde" stroke="#99a"/>']
+    parts = [f'<circle cx="{middle}" cy="{middle}" r="{middle / reach:.1f}" fill="#dde" stroke="#99a"/>']
     for eye, axis in zip(eyes, axes, strict=True):
         (x, y), (u, v) = place(eye), place(eye + 0.12 * reach * axis)
         parts.append(f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{u:.1f}" y2="{v:.1f}" stroke="#c63"/>')
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.5" fill="#c63"/>')
-    return _svg(side, side, "".join(parts) + _text(8, 16, name))
+    return "".join(parts) + _text(8, 16, name)
 
 
 def _text(x: float, y: float, text: str, anchor: str = "start") -> str:

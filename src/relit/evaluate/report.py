@@ -14,7 +14,7 @@ import numpy as np
 from relit.asset.asset import load_asset
 from relit.capture.procedural import evening, studio
 from relit.conventions import linear_from_srgb, rotate_environment
-from relit.evaluate.curves import bars, camera_plot, curve
+from relit.evaluate.curves import ball_of, bars, camera_plot, curve
 from relit.evaluate.metrics import encode, psnr
 from relit.files import parse_toml, read_json, write_text
 from relit.images import encode_jpeg
@@ -57,7 +57,7 @@ def write_report(run: str | Path, capture: Capture | None = None) -> Path:
         _section("Light", _light(asset)),
         _section("Another light", _turntables(asset)),
         _section("Figures against the truth", _figures(run)),
-        _section("Cameras", camera_plot(asset)),
+        _section("Cameras", camera_plot([c for _, c in asset.cameras], ball_of(asset))),
         _section("Losses", _losses(run)),
         _section("Time and memory", _costs(run)),
         _section("Textures", _textures(asset)),
