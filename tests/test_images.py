@@ -155,6 +155,25 @@ def test_small_copies_agree_with_the_whole_picture(tmp_path, suffix):
     np.testing.assert_allclose(small.rgb, cv2.resize(array, (w, h), interpolation=cv2.INTER_AREA), atol=0.03)
 
 
+@pytest.mark.parametrize("data, display", [((1, 1, 2, 3), (0, 0, 5, 4)), ((-1, -1, 4, 4), (0, 0, 3, 2))])
+def test_the_display_window_of_an_exr_is_read(tmp_path, data, display):
+    import OpenEXR
+
+    (x0, y0, x1, y1), (_, _, u1, v1) = data, display
+    y, x = np.mgrid[y0 : y1 + 1, x0 : x1 + 1]
+    pixels = np.stack([x, y, x + 0 * y], -1).astype(np.float32) + 10
+    head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    head["dataWindow"] = (np.array([x0, y0], np.int32), np.array([x1, y1], np.int32))
+    head["displayWindow"] = (np.array([0, 0], np.int32), np.array([u1, v1], np.int32))
+    with OpenEXR.File(head, {"RGB": np.ascontiguousarray(pixels)}) as f:
+        f.write(str(tmp_path / "a.exr"))
+    rgb = images.read_image(tmp_path / "a.exr").rgb
+    assert rgb.shape == (v1 + 1, u1 + 1, 3)
+    for row, col in ((0, 0), (2, 1), (2, 2), (v1, u1)):
+        inside = x0 <= col <= x1 and y0 <= row <= y1
+        np.testing.assert_array_equal(rgb[row, col], [col + 10, row + 10, col + 10] if inside else [0, 0, 0])
+
+
 def test_layers_of_an_exr(tmp_path):
     import OpenEXR
 

@@ -319,18 +319,21 @@ def _exr(path: Path, header_only: bool = False):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as f:
-                head = f.header()
-                (x0, y0), (x1, y1) = (np.asarray(v, dtype=int) for v in head["displayWindow"])
-                dx, dy = (int(v) for v in np.asarray(head["dataWindow"][0]) - (x0, y0))
-                h, w = int(y1 - y0 + 1), int(x1 - x0 + 1)
-                _too_large(path, w, h)
-                if header_only:
-                    return [c.name for c in head["channels"]], (h, w)
+            with OpenEXR.File(str(path), separate_channels=True, header_only=True) as f:
+                head = f.header()  # emptied when the file is closed
+                windows = [np.asarray(head[k], dtype=np.int64) for k in ("displayWindow", "dataWindow")]
+                names = [c.name for c in head["channels"]]
+            for window in windows:  # before any pixel is decoded
+                _too_large(path, *(int(v) for v in window[1] - window[0] + 1))
+            w, h = (int(v) for v in windows[0][1] - windows[0][0] + 1)
+            dx, dy = (int(v) for v in windows[1][0] - windows[0][0])
+            if header_only:
+                return names, (h, w)
+            with OpenEXR.File(str(path), separate_channels=True) as f:
                 channels = {name: c.pixels for name, c in f.channels().items()}
     except UserError:
         raise
-    except (RuntimeError, ValueError, TypeError, KeyError, OSError) as error:
+    except (RuntimeError, ValueError, TypeError, KeyError, OSError, MemoryError) as error:
         raise _broken(path, str(error)) from error
     names = _exr_layer(list(channels))
     if not names or len({channels[n].shape for n in names}) != 1:

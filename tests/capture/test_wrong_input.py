@@ -119,6 +119,23 @@ def test_inverted_masks_are_turned_with_a_note(capture_folder, cameras):
     np.testing.assert_allclose(capture.photos[2].load().mask, shots.picture(cameras[2])[1], atol=0.01)
 
 
+def test_an_inverted_alpha_channel(tmp_path, cameras):
+    for i, camera in enumerate(cameras):
+        rgb, alpha = shots.picture(camera)
+        images.write_srgb(tmp_path / f"{i}.png", np.concatenate([rgb, 1 - alpha[..., None]], -1))
+    refused(tmp_path, "alpha channel looks inverted")
+
+
+def test_an_opaque_alpha_channel_is_no_mask(tmp_path, cameras):
+    for i, camera in enumerate(cameras):
+        rgb, alpha = shots.picture(camera)
+        background = np.random.default_rng(i).uniform(size=rgb.shape) * (1 - alpha[..., None])
+        images.write_srgb(tmp_path / f"{i}.png", np.concatenate([rgb + background, np.ones_like(alpha)[..., None]], -1))
+    capture = open_capture(tmp_path)
+    assert capture.photos[0].load().mask is None and not capture.black_background
+    assert any("opaque everywhere" in n for n in capture.notes)
+
+
 def test_a_mask_of_another_shape(capture_folder):
     for i in range(6):
         mask = np.zeros((72, 56) if i == 3 else (56, 72))

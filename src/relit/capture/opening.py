@@ -154,7 +154,10 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
     if wanted in ("auto", "alpha") and all(h.alpha for h in headers):
         small = [_small(p).alpha for p in photos]
         if wanted == "alpha" or any((a < 0.5).any() for a in small):
-            _, empty = judge({f.name: a for f, a in zip(reading.frames, small, strict=True)}, "the alpha channel")
+            inverted, empty = judge({f.name: a for f, a in zip(reading.frames, small, strict=True)}, "the alpha channel")
+            if inverted:
+                why = "it is opaque at the border and clear in the middle"
+                raise UserError("the alpha channel looks inverted", why, "invert it, or use --masks none")
             _say_empty(empty, notes)
             notes.append("masks come from the alpha channel; the photos are composited on black")
             return [_with(p, mask=True) for p in photos], small, True
@@ -164,6 +167,8 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
             f"{sum(not h.alpha for h in headers)} of {len(headers)} photos have no alpha channel",
             fix="give mask files, or another kind of masks",
         )
+    elif any(h.alpha for h in headers):
+        notes.append(f"only {sum(h.alpha for h in headers)} of {len(headers)} photos have an alpha channel: it is not used as a mask")
     if wanted in ("auto", "files"):
         result = _from_files(reading, photos, wanted == "files", notes)
         if result is not None:

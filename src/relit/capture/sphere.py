@@ -34,8 +34,8 @@ def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sp
         return sphere_from_masks([v for v in views if v.mask is not None]), "the masks"
     sphere = sphere_from_rays([v.camera for v in views])
     if points is not None and len(points) >= 50:
-        near = np.linalg.norm(points - sphere.centre, axis=1) < 1.5 * sphere.radius
-        if near.mean() > 0.9:  # there is nothing but the object: a turntable, or masked photos
+        near = np.linalg.norm(points - sphere.centre, axis=1) < 1.2 * sphere.radius
+        if near.mean() > 0.95:  # there is nothing but the object: a turntable, or masked photos
             return sphere_from_points(points[near]), "the sparse points"
     return sphere, "the cameras' viewing directions"
 
