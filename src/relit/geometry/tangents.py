@@ -14,9 +14,11 @@ def _unit(x):
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """(V, 3) float32 unit normals weighted by corner angles; vertices at one position (a UV seam) share their normal."""
+    """(V, 3) float32 unit normals weighted by corner angles; vertices at one position (a UV seam), to a
+    millionth of the mesh, share their normal."""
     v, f = np.asarray(mesh.vertices, np.float64), mesh.faces
-    _, ident = np.unique(np.ascontiguousarray(mesh.vertices, np.float32), axis=0, return_inverse=True)
+    grid = max(float(np.ptp(v, axis=0).max(initial=0.0)), 1e-30) * 1e-6
+    _, ident = np.unique(np.round((v - v.min(0, initial=np.inf)) / grid).astype(np.int64), axis=0, return_inverse=True)
     ident = ident.reshape(-1)
     corners = v[f]  # [F, 3, 3]
     face = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
