@@ -24,6 +24,12 @@ def test_a_command_is_timed_and_its_memory_measured(tmp_path):
     assert small < 0.1  # a later command does not inherit the peak of an earlier one
 
 
+def test_a_command_starts_cold(tmp_path):
+    script = "import os; print(len(os.listdir(os.environ['DRJIT_CACHE_DIR'])))"
+    benchmark.timed([sys.executable, "-c", script], tmp_path / "log.txt")
+    assert (tmp_path / "log.txt").read_text() == "0\n"
+
+
 def test_a_failed_command_shows_the_end_of_its_output(tmp_path):
     with pytest.raises(UserError) as error:
         benchmark.timed([sys.executable, "-c", "print('the reason'); raise SystemExit(4)"], tmp_path / "log.txt")
