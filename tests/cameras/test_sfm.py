@@ -1,5 +1,7 @@
 """Cameras from photos alone, on drawn pictures of a textured corner of a room."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
@@ -103,3 +105,9 @@ def test_two_photos_are_too_few(folder, tmp_path):
     capture = open_capture(folder, masks="none")
     with pytest.raises(UserError, match="2 photos are not enough"):
         find_cameras(replace(capture, photos=capture.photos[:2]), workdir=tmp_path)
+
+
+def test_pycolmap_does_not_break_zlib():
+    """Without the guard in `relit/__init__.py` this aborts: pycolmap's zlib symbols take the place of libz's."""
+    code = "import relit, pycolmap, zlib; data = bytes(range(256)) * 8192; assert zlib.decompress(zlib.compress(data, 4)) == data"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
