@@ -236,7 +236,7 @@ def test_the_unspoilt_capture_is_recognised(capsys, capture):
     found = json.loads(out)
     assert code == 0 and found["photos"] == 6 and found["cameras"] == "given" and found["sizes"] == [[48, 48]]
     assert all(0.05 < share < 0.6 for share in found["masks"].values())
-    assert np.linalg.norm(found["sphere"]["centre"]) < 0.3 and 0.7 < found["sphere"]["radius"] < 1.8
+    assert np.linalg.norm(found["sphere"]["centre"]) < 0.3 and 0.7 < found["sphere"]["radius"] < 1.1
     code, out, _ = relit(capsys, "inspect", capture)
     assert code == 0 and "6 of 48x48 pixels" in out and "recognised as" in out
 

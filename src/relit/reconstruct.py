@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import platform
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -83,6 +84,9 @@ def _begin(run: Run, capture: Capture, device: str, cost: Cost) -> None:
     run.say(f"{len(capture.photos)} photos ({capture.format}), {'cameras given' if capture.has_cameras else 'no cameras'}, on {device}")
     for note in capture.notes:
         run.say(f"note: {note}")
+    free = shutil.disk_usage(run.folder).free
+    if free < cost.disk:
+        run.say(f"note: {readable_bytes(free)} of disk are free, a run takes up to {readable_bytes(cost.disk)}")
     run.say(f"about {readable_seconds(cost.seconds)} and {readable_bytes(cost.memory)} of memory on 2 cores")
 
 

@@ -88,7 +88,7 @@ def _seen(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
             f"the cameras look away from each other: only {seen.sum()} of {len(seen)} see the point that their axes approach most",
             "the poses use other axes than the format says (camera_from_world instead of world_from_camera, or y and z flipped), "
             "or the photos do not go around one object",
-            "check one pose by hand, or give the object sphere (--sphere X Y Z RADIUS)",
+            "check one pose by hand, or give the object sphere (--sphere X,Y,Z,RADIUS)",
         )
     return seen
 
@@ -142,7 +142,7 @@ def sphere_from_masks(views: list[View]) -> Sphere:
         raise UserError(
             "the masks of different photos have no place in common",
             "masks and cameras do not belong together, the poses use other axes than the format says, or the masks show different things",
-            "check one pose and one mask by hand, or give the object sphere (--sphere X Y Z RADIUS)",
+            "check one pose and one mask by hand, or give the object sphere (--sphere X,Y,Z,RADIUS)",
         )
     centre, reach = smallest_ball(kept)
     return Sphere(centre, (reach + 0.5 * float(np.linalg.norm(cell))) / FILL)
@@ -178,7 +178,9 @@ def _carve(views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np
         front &= (np.abs(xy) < 4).all(axis=1)  # polynomial lenses fold back far off the axis
         pixel = np.floor(pixels_from_ideal(c, view.lens, np.where(front[:, None], xy, 0.0))).astype(int)
         inside = front & (pixel >= 0).all(axis=1) & (pixel[:, 0] < w) & (pixel[:, 1] < h)
-        shown += inside
+        # a mask that keeps off the picture's border shows the whole object: there is none of it outside the picture
+        whole = not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
+        shown += inside | whole
         hit[inside] += mask[pixel[inside, 1], pixel[inside, 0]]
         alive = shown - hit <= spare
         points, shown, hit = points[alive], shown[alive], hit[alive]
