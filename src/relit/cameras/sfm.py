@@ -33,8 +33,9 @@ SMALL_MASK = 256
 class Settings:
     """One try.
 
-    features: at most so many per photo. inliers: matches that a photo needs to be registered. start, start_angle: matches and angle
-    (degrees) that the first pair needs. peak: SIFT's threshold. ratio: Lowe's. focal_factor: focal length to start with / longer side.
+    features: at most so many per photo. upsampled: look for them at twice the size as well (three times slower).
+    inliers: matches that a photo needs to be registered. start, start_angle: matches and angle (degrees) that the first pair needs.
+    peak: SIFT's threshold. ratio: Lowe's. focal_factor: focal length to start with / longer side.
     """
 
     title: str
@@ -42,6 +43,7 @@ class Settings:
     start: int
     start_angle: float
     features: int = 2048
+    upsampled: bool = True
     peak: float = 0.0067
     ratio: float = 0.8
     guided: bool = False
@@ -125,8 +127,10 @@ def find_cameras(capture: Capture, *, seed: int = 0, workdir: Path, focal: float
 
 
 def _plan(photos: list[Photo], capture: Capture, has_masks: bool, focal: float | None) -> list[Settings]:
+    large = max(max(p.width, p.height) for p in photos) >= 800  # small photos need every feature that there is
     few = len(photos) < 20
     first = replace(STANDARD, inliers=15, start=40, start_angle=8.0) if few else STANDARD
+    first = replace(first, upsampled=few or not large)
     plan = [first, LOOSE]
     if has_masks and not capture.black_background:  # the surroundings may carry the texture that the object lacks
         plan.append(replace(LOOSE, title=LOOSE.title + ", without masks", with_masks=False))
@@ -161,6 +165,7 @@ def _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_
     extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
     extraction.sift.peak_threshold = settings.peak
     extraction.sift.max_num_features = settings.features
+    extraction.sift.first_octave = -1 if settings.upsampled else 0
     for indices in _groups(photos, scales).values():
         p = photos[indices[0]]
         s, side = scales[indices[0]], max(p.width, p.height)
