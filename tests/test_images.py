@@ -87,7 +87,7 @@ def test_exif_orientation_is_applied_once(tmp_path, orientation):
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_sixteen_bit_files_turn_as_eight_bit_ones(tmp_path, orientation):
     codes = np.random.default_rng(0).integers(0, 255, (5, 7, 3)).astype(np.uint8)
-    wide = images._turned(codes, orientation)
+    wide = images.turn_upright(codes, orientation)
     exif = PilImage.Exif()
     exif[0x0112] = orientation
     PilImage.fromarray(codes).save(tmp_path / "a.png", exif=exif)

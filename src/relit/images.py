@@ -46,14 +46,18 @@ class Header:
     """What a file says before it is decoded.
 
     width, height: pixels, upright. alpha: has an alpha channel. focal: EXIF focal length in pixels, or None.
-    turned: the EXIF orientation swaps the sides.
+    orientation: EXIF's, 1 to 8; from 5 on the sides of the stored picture are swapped.
     """
 
     width: int
     height: int
     alpha: bool = False
     focal: float | None = None
-    turned: bool = False
+    orientation: int = 1
+
+    @property
+    def turned(self) -> bool:
+        return self.orientation >= 5
 
 
 # ---------------------------------------------------------------- reading
@@ -140,10 +144,11 @@ def read_header(path: str | Path) -> Header:
         w, h = image.size
         # Pillow decodes a whole PNG to look for EXIF behind the pixels; what stands before them is enough here
         exif = image.getexif() if image.format != "PNG" or "exif" in image.info else PilImage.Exif()
-        turned = exif.get(0x0112, 1) in (5, 6, 7, 8)
-        w, h = (h, w) if turned else (w, h)
+        orientation = exif.get(0x0112, 1)
+        orientation = orientation if orientation in range(1, 9) else 1
+        w, h = (h, w) if orientation >= 5 else (w, h)
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-        return Header(w, h, has_alpha, _focal(exif, w, h), turned)
+        return Header(w, h, has_alpha, _focal(exif, w, h), orientation)
 
 
 def _focal(exif, width: int, height: int) -> float | None:
@@ -236,10 +241,10 @@ def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
         raise ValueError("the pixels could not be decoded")
     if array.ndim == 3:
         array = array[..., [2, 1, 0, 3][: array.shape[2]]] if array.shape[2] >= 3 else array
-    return _turned(array, orientation)
+    return turn_upright(array, orientation)
 
 
-def _turned(array: np.ndarray, orientation: int) -> np.ndarray:
+def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """Apply EXIF's orientation (1 to 8) to an array (H, W[, C])."""
     if orientation in (5, 6, 7, 8):
         array = array.swapaxes(0, 1)

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from relit.cameras.pinhole import lens_of
@@ -215,7 +216,7 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
             else "no mask folder was found and no file ends in _mask.png",
             f"add the masks, or use --masks none: {folder or reading.root}",
         )
-    small = [None if m is None or not m.is_file() else _shrunk(read_mask(m)) for m in files]
+    small = [None if m is None or not m.is_file() else _small_mask(m, p) for m, p in zip(files, photos, strict=True)]
     where = f"{folder.name}/" if folder else "the mask files"
     inverted, empty = judge({f.name: m for f, m in zip(reading.frames, small, strict=True) if m is not None}, where)
     small = [1.0 - m if inverted and m is not None else m for m in small]
@@ -226,15 +227,11 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
     return [_with(p, mask=m, invert=inverted) for p, m in zip(photos, files, strict=True)], small, False
 
 
-def _shrunk(mask: np.ndarray) -> np.ndarray:
-    import cv2
-
-    s = SMALL / max(mask.shape)
-    return (
-        mask
-        if s >= 1
-        else cv2.resize(mask, (max(1, round(mask.shape[1] * s)), max(1, round(mask.shape[0] * s))), interpolation=cv2.INTER_AREA)
-    )
+def _small_mask(path: Path, p: Photo) -> np.ndarray:
+    mask = photo.upright_mask(read_mask(path), (p.height, p.width), p.load.orientation)
+    h, w = mask.shape
+    s = min(1.0, SMALL / max(h, w))
+    return mask if s == 1 else cv2.resize(mask, (max(1, round(w * s)), max(1, round(h * s))), interpolation=cv2.INTER_AREA)
 
 
 def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):

@@ -13,7 +13,7 @@ import numpy as np
 from relit.cameras.pinhole import Lens, lens_of, undistorted_camera, undistortion_map
 from relit.capture.frames import Frame, Reading, image_folder, list_images
 from relit.errors import UserError
-from relit.images import EXTENSIONS, Header, read_data, read_header, read_image
+from relit.images import EXTENSIONS, Header, read_data, read_header, read_image, turn_upright
 from relit.masks.files import read_mask
 from relit.masks.threshold import Backdrop
 from relit.scene import Camera, Photo, Pixels
@@ -26,6 +26,7 @@ class Decoder:
     """Reads one photo file. Called without arguments it returns the upright `Pixels` at `size` (width, height), lens distortion kept.
 
     mask: a file, a backdrop, True for the file's own alpha channel, or None. invert: the mask file is white off the object.
+    orientation: the photo's in EXIF, for masks that were made from the pixels as stored.
     """
 
     path: Path
@@ -34,6 +35,7 @@ class Decoder:
     mask: Path | Backdrop | bool | None = None
     invert: bool = False
     normal: Path | None = None
+    orientation: int = 1
 
     def __call__(self) -> Pixels:
         image = read_image(self.path, self.upright)
@@ -43,7 +45,7 @@ class Decoder:
         if self.mask is True:
             mask = image.alpha
         elif isinstance(self.mask, Path):
-            mask = file_mask(self.mask, shape, self.invert)
+            mask = file_mask(self.mask, shape, self.invert, self.orientation)
         elif isinstance(self.mask, Backdrop):
             mask = self.mask(rgb)
             if self.mask.dark:
@@ -147,15 +149,15 @@ def photo_from(frame: Frame, header: Header, max_side: int | None, normals: dict
         size = (w, h)
     focal = None if header.focal is None else header.focal * size[0] / w
     normal = find_normal(frame.path, normals or {})
-    return Photo(frame.name, Decoder(frame.path, size, upright, normal=normal), *size, focal_hint=focal)
+    return Photo(frame.name, Decoder(frame.path, size, upright, normal=normal, orientation=header.orientation), *size, focal_hint=focal)
 
 
 # ---------------------------------------------------------------- masks and normals from files
 
 
-def file_mask(path: Path, shape: tuple[int, int], invert: bool = False) -> np.ndarray:
+def file_mask(path: Path, shape: tuple[int, int], invert: bool = False, orientation: int = 1) -> np.ndarray:
     """A mask file at the size of its photo (H, W). Raises UserError when the shapes differ."""
-    mask = read_mask(path)
+    mask = upright_mask(read_mask(path), shape, orientation)
     h, w = shape
     if mask.shape != (h, w):
         if abs(mask.shape[1] / mask.shape[0] - w / h) > 0.02 * (w / h):
@@ -184,6 +186,12 @@ def find_normal(photo: Path, index: dict[str, Path]) -> Path | None:
         if beside.is_file():
             return beside
     return index.get(photo.stem)
+
+
+def upright_mask(mask: np.ndarray, shape: tuple[int, int], orientation: int) -> np.ndarray:
+    """Turn a mask that was made from the pixels as stored, before EXIF turned the photo; its shape (H, W) tells."""
+    wide, upright = mask.shape[1] > mask.shape[0], shape[1] > shape[0]
+    return turn_upright(mask, orientation) if orientation >= 5 and wide != upright else mask
 
 
 def read_normal(path: Path, shape: tuple[int, int]) -> np.ndarray:
