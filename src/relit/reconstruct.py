@@ -95,14 +95,16 @@ def with_cameras(capture: Capture, run: Run, job: Job) -> Capture:
     if capture.has_cameras:
         return capture
     from relit.cameras.sfm import find_cameras
+    from relit.capture import with_grabcut
 
     # the finder keeps its own model in the stage's folder, so a second call after a stop is cheap
     if run.done("cameras"):
-        return find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=job.focal)[0]
+        found, _ = find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=job.focal)
+        return with_grabcut(found) if job.masks == "grabcut" else found
     with run.stage("cameras", title="cameras from photos") as stage:
         found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=job.focal)
     run.say(str(verdict))
-    return found
+    return with_grabcut(found) if job.masks == "grabcut" else found  # it is seeded by the object sphere, so it had to wait for the cameras
 
 
 def _save(run: Run, asset, capture: Capture, kind: str, job: Job, device: str) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from relit import images
+from relit.cameras import sfm
 from relit.cameras.se3 import camera_errors, look_at
 from relit.cameras.sfm import find_cameras
 from relit.capture import open_capture
@@ -16,6 +17,9 @@ from relit.errors import EXIT_FAILED, UserError
 from relit.scene import Camera
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 240.0
+
+
+CORNER = np.array([-1.0, 1.0, 1.0])
 
 
 def texture(seed):
@@ -28,7 +32,7 @@ TEXTURES = [texture(i) for i in range(3)]
 
 
 def photo(camera):
-    """The planes x = -1, y = 1 (below) and z = 1, each 4 x 4, with a texture on it; linear (H, W, 3)."""
+    """The planes x = -1, y = 1 (below) and z = 1, each 4 x 4, with a texture on it: linear (H, W, 3), and a mask of its corner (H, W)."""
     gx, gy = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy)
     d = np.stack([gx, gy, np.ones_like(gx)], -1) @ camera.world_from_camera[:3, :3].T
     rgb, depth = np.full((*gx.shape, 3), 0.2, np.float32), np.full(gx.shape, np.inf)
@@ -40,7 +44,8 @@ def photo(camera):
         xy = [((c + 2) * 127.9).astype(np.float32) for c in (u, v)]
         rgb[hit] = cv2.remap(TEXTURES[axis], *xy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[hit]
         depth[hit] = t[hit]
-    return rgb
+    points = camera.centre + np.where(np.isfinite(depth), depth, 1e6)[..., None] * d
+    return rgb, (np.linalg.norm(points - CORNER, axis=-1) < 1.5).astype(np.float32)
 
 
 def arc(count=6):
@@ -57,18 +62,24 @@ def arc(count=6):
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("room")
     for i, camera in enumerate(arc()):
-        images.write_srgb(path / f"{i}.png", photo(camera))
+        rgb, mask = photo(camera)
+        images.write_srgb(path / "images" / f"{i}.png", rgb)
+        images.write_data(path / "masks" / f"{i}.png", mask)
     return path
 
 
 def test_a_textured_corner(folder, tmp_path):
     truth = arc()
-    capture = open_capture(folder, masks="none")
+    capture = open_capture(folder)
+    assert capture.photos[0].load().mask.mean() > 0.2
     found, verdict = find_cameras(capture, workdir=tmp_path)
+    assert any("found from the masks" in n for n in found.notes)
     assert verdict.registered == verdict.total == 6 and verdict.reason == "" and verdict.mean_error < 1.0
     assert found.has_cameras and found.sphere is not None and len(found.points) > 50
     poses = np.stack([p.camera.world_from_camera for p in found.photos])
     angle, distance = camera_errors(poses, np.stack([c.world_from_camera for c in truth]))
+    inside = np.linalg.norm(found.points - np.median(found.points, axis=0), axis=1)
+    assert np.quantile(inside, 0.95) < 1.2 * found.sphere.radius  # features off the masks are not used
     assert np.median(angle) < 0.5 and np.median(distance) < 0.05
     assert found.photos[0].camera.fx == pytest.approx(FOCAL, rel=0.05)
     assert found.photos[0].load().rgb.shape == (found.photos[0].height, found.photos[0].width, 3)
@@ -78,11 +89,12 @@ def test_a_textured_corner(folder, tmp_path):
     np.testing.assert_array_equal(again.photos[3].camera.world_from_camera, found.photos[3].camera.world_from_camera)
 
 
-def test_a_fixed_focal_stays_and_strangers_are_left_out_with_a_reason(folder, tmp_path):
+def test_a_fixed_focal_stays_and_strangers_are_left_out_with_a_reason(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm, "EXHAUSTIVE", 3)  # matched along the order of names, as a large capture is
     room = tmp_path / "room"
     room.mkdir()
     for i in range(1, 5):
-        (room / f"{i}.png").write_bytes((folder / f"{i}.png").read_bytes())
+        (room / f"{i}.png").write_bytes((folder / "images" / f"{i}.png").read_bytes())
     images.write_srgb(room / "blank.png", np.full((HEIGHT, WIDTH, 3), 0.4))
     found, verdict = find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focal=FOCAL)
     assert (verdict.registered, verdict.total) == (4, 5)

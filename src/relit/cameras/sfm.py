@@ -76,7 +76,7 @@ class Verdict:
 def find_cameras(capture: Capture, *, seed: int = 0, workdir: Path, focal: float | None = None) -> tuple[Capture, Verdict]:
     """Find the cameras of `capture.photos`; photos that could not be registered are left out with a note.
 
-    focal: focal length in pixels of the photos' longer side's size, kept fixed; else EXIF's is refined, else it is found.
+    focal: focal length in pixels of the photos as decoded (`Photo.width`), kept fixed; else EXIF's is refined, else it is found.
     workdir: a folder of its own. The model found stays there: a second call with the same photos reads it instead of searching again.
     The frame is COLMAP's (arbitrary, scale as well).
     Raises UserError (exit code 4) when fewer than three photos can be registered.

@@ -153,9 +153,9 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
     """-> (photos that know their masks, small masks (h, w) or None, True when the background is black)."""
     none = [None] * len(photos)
     if wanted in ("auto", "alpha") and all(h.alpha for h in headers):
-        small = [_small(p).alpha for p in photos]
-        if wanted == "alpha" or any((a < 0.5).any() for a in small):
-            inverted, empty = judge({f.name: a for f, a in zip(reading.frames, small, strict=True)}, "the alpha channel")
+        small = [None if f.held_out else _small(p).alpha for f, p in zip(reading.frames, photos, strict=True)]
+        if wanted == "alpha" or any((a < 0.5).any() for a in small if a is not None):
+            inverted, empty = judge(_named(reading, small), "the alpha channel")
             if inverted:
                 why = "it is opaque at the border and clear in the middle"
                 raise UserError("the alpha channel looks inverted", why, "invert it, or use --masks none")
@@ -187,6 +187,10 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
     return photos, none, False
 
 
+def _named(reading: Reading, small: list) -> dict[str, np.ndarray]:
+    return {f.name: m for f, m in zip(reading.frames, small, strict=True) if m is not None}
+
+
 def _small(p: Photo) -> Image:
     return read_small(p.load.path, SMALL, p.load.upright)
 
@@ -216,14 +220,15 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
             else "no mask folder was found and no file ends in _mask.png",
             f"add the masks, or use --masks none: {folder or reading.root}",
         )
-    small = [None if m is None or not m.is_file() else _small_mask(m, p) for m, p in zip(files, photos, strict=True)]
+    small = [None if f.held_out else _small_mask(m, p) for f, m, p in zip(reading.frames, files, photos, strict=True)]
     where = f"{folder.name}/" if folder else "the mask files"
-    inverted, empty = judge({f.name: m for f, m in zip(reading.frames, small, strict=True) if m is not None}, where)
+    inverted, empty = judge(_named(reading, small), where)
     small = [1.0 - m if inverted and m is not None else m for m in small]
     notes.append(f"masks come from {where}")
     if inverted:
         notes.append("the masks were white off the object and have been inverted")
     _say_empty(empty, notes)
+    files = [m if m is not None and m.is_file() else None for m in files]  # of a held-out photo it may be missing
     return [_with(p, mask=m, invert=inverted) for p, m in zip(photos, files, strict=True)], small, False
 
 
@@ -236,7 +241,7 @@ def _small_mask(path: Path, p: Photo) -> np.ndarray:
 
 def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
     step = max(1, len(photos) // LOOKED_AT)
-    looked = [_small(p).rgb for p in photos[::step]]
+    looked = [_small(p).rgb for f, p in zip(reading.frames[::step], photos[::step], strict=True) if not f.held_out]
     backdrop: Backdrop | None = find_backdrop(looked)
     if backdrop is None:
         if asked:
@@ -246,8 +251,8 @@ def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: li
                 "give mask files, or use --masks none to fit the background as well",
             )
         return None
-    small = [backdrop(_small(p).rgb) for p in photos]
-    _, empty = judge({f.name: m for f, m in zip(reading.frames, small, strict=True)}, "the threshold")
+    small = [None if f.held_out else backdrop(_small(p).rgb) for f, p in zip(reading.frames, photos, strict=True)]
+    _, empty = judge(_named(reading, small), "the threshold")
     _say_empty(empty, notes)
     kind = "dark" if backdrop.dark else "plain"
     notes.append(
