@@ -127,7 +127,7 @@ def test_missing_unknown_and_oversized_files(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="not an image format"):
         images.read_image(tmp_path / "a.txt")
     images.write_srgb(tmp_path / "a.png", RAMP)
-    monkeypatch.setattr(images, "MAX_PIXELS", 10)
+    monkeypatch.setattr(images.decode, "MAX_PIXELS", 10)
     with pytest.raises(UserError, match="too large: 8 x 6"):
         images.read_image(tmp_path / "a.png")
 

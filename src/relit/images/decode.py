@@ -1,0 +1,213 @@
+"""From a file to an array of codes, or of linear floats: one decoder per format, each refusing what is damaged or too large."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from PIL import Image as PilImage
+from PIL import ImageOps, UnidentifiedImageError
+
+from relit.errors import UserError
+
+MAX_PIXELS = 200_000_000  # larger files are refused before they are decoded
+HEIC = {".heic", ".heif"}
+RAW = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".rw2", ".raf"}
+FLOAT = {".exr", ".hdr"}
+CODED = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
+EXTENSIONS = CODED | FLOAT | HEIC | RAW
+
+
+def checked(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if not path.is_file():
+        raise UserError(
+            "an image file is missing", "it is named by the capture or the command, but is not there", f"check the path: {path}"
+        )
+    if suffix not in EXTENSIONS:
+        raise UserError(f"'{suffix}' is not an image format that can be read", fix=f"use one of {' '.join(sorted(EXTENSIONS))}: {path}")
+    return suffix
+
+
+def _too_large(path: Path, width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise UserError(
+            f"an image is too large: {width} x {height} pixels",
+            f"the limit is {MAX_PIXELS / 1e6:.0f} megapixels",
+            f"make it smaller: {path}",
+        )
+
+
+def decode(path: Path, upright: bool = True) -> tuple[np.ndarray, bool]:
+    """-> ((H, W[, C]) uint8, uint16 or float32 array, True when it is linear already)."""
+    suffix = checked(path)
+    if suffix == ".exr":
+        return _finite(exr(path)[0], path), True
+    if suffix == ".hdr":
+        import cv2
+
+        _too_large(path, *hdr_size(path))
+        array = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if array is None:
+            raise broken(path, "not a Radiance HDR file")
+        return _finite(np.ascontiguousarray(array[..., ::-1]), path), True
+    if suffix in RAW:
+        with rawpy().imread(str(path)) as raw:  # camera white balance, no automatic exposure, linear
+            array = raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True)
+        return array, True
+    with pil(path) as image:
+        try:
+            if _is_sixteen_bit(path, suffix):
+                return _sixteen_bit(path, image.getexif().get(0x0112, 1) if upright else 1), False
+            image = ImageOps.exif_transpose(image) if upright else image
+            if image.mode in ("P", "PA") or "transparency" in image.info:
+                image = image.convert("RGBA")
+            elif image.mode in ("1", "CMYK", "YCbCr", "HSV", "LAB"):
+                image = image.convert("L" if image.mode == "1" else "RGB")
+            array = np.array(image)
+        except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
+            raise broken(path, str(error)) from error
+    if array.dtype == np.int32:  # PIL's mode I: 16-bit grey
+        array = np.clip(array, 0, 65535).astype(np.uint16)
+    return array, False
+
+
+def _is_sixteen_bit(path: Path, suffix: str) -> bool:
+    if suffix == ".png":
+        with open(path, "rb") as f:
+            return f.read(25)[24:25] == b"\x10"
+    return suffix in (".tif", ".tiff")
+
+
+def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
+    """OpenCV keeps all 16 bits where Pillow drops the lower eight of a colour file."""
+    import cv2
+
+    array = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if array is None or array.dtype.kind not in "uf":
+        raise ValueError("the pixels could not be decoded")
+    if array.ndim == 3:
+        array = array[..., [2, 1, 0, 3][: array.shape[2]]] if array.shape[2] >= 3 else array
+    return turn_upright(array, orientation)
+
+
+def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
+    """Apply EXIF's orientation (1 to 8) to an array (H, W[, C])."""
+    if orientation in (5, 6, 7, 8):
+        array = array.swapaxes(0, 1)
+    flips = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}.get(orientation, (1, 1))
+    return np.ascontiguousarray(array[:: flips[0], :: flips[1]])
+
+
+@contextmanager
+def pil(path: Path):
+    if path.suffix.lower() in HEIC:
+        try:
+            from pillow_heif import register_heif_opener
+        except ImportError as error:
+            raise UserError(
+                "HEIC photos need an optional package",
+                "pillow-heif is not installed",
+                f"pip install 'relit[heic]', or convert to JPEG: {path}",
+            ) from error
+        register_heif_opener()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow warns of large images; the limit here is our own, and an error
+            image = PilImage.open(path)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, PilImage.DecompressionBombError) as error:
+        raise broken(path, str(error)) from error
+    with image:
+        _too_large(path, *image.size)
+        yield image
+
+
+def rawpy():
+    try:
+        import rawpy
+    except ImportError as error:
+        raise UserError(
+            "RAW photos need an optional package",
+            "rawpy is not installed",
+            "pip install 'relit[raw]', or convert the photos to JPEG or EXR",
+        ) from error
+    return rawpy
+
+
+def broken(path: Path, reason: str) -> UserError:
+    return UserError(
+        "an image file cannot be read",
+        f"{reason.replace(str(path), 'the file')} (truncated or damaged)",
+        f"copy it again or take it out of the folder: {path}",
+    )
+
+
+def _finite(array: np.ndarray, path: Path) -> np.ndarray:
+    bad = ~np.isfinite(array).reshape(array.shape[0], array.shape[1], -1).all(axis=-1)
+    if bad.any():
+        row, col = np.argwhere(bad)[0]
+        raise UserError(
+            f"an image holds {int(bad.sum())} pixels that are NaN or infinite (the first at column {col}, row {row})",
+            "a renderer or an HDR merge wrote them; they would spread through the whole fit",
+            f"replace them before: {path}",
+        )
+    return array
+
+
+def hdr_size(path: Path) -> tuple[int, int]:
+    with open(path, "rb") as f:
+        head = f.read(4096)
+    for line in head.split(b"\n")[1:]:
+        words = line.split()
+        if len(words) == 4 and words[0] in (b"-Y", b"+Y") and words[1].isdigit() and words[3].isdigit():
+            return int(words[3]), int(words[1])
+    raise broken(path, "not a Radiance HDR file")
+
+
+def exr(path: Path, header_only: bool = False):
+    """-> ((H, W, C) float32, shape), or (channel names, shape) for the header. The display window is what is read."""
+    import OpenEXR
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with OpenEXR.File(str(path), separate_channels=True, header_only=True) as f:
+                head = f.header()  # emptied when the file is closed
+                windows = [np.asarray(head[k], dtype=np.int64) for k in ("displayWindow", "dataWindow")]
+                names = [c.name for c in head["channels"]]
+            for window in windows:  # before any pixel is decoded
+                _too_large(path, *(int(v) for v in window[1] - window[0] + 1))
+            w, h = (int(v) for v in windows[0][1] - windows[0][0] + 1)
+            dx, dy = (int(v) for v in windows[1][0] - windows[0][0])
+            if header_only:
+                return names, (h, w)
+            with OpenEXR.File(str(path), separate_channels=True) as f:
+                channels = {name: c.pixels for name, c in f.channels().items()}
+    except UserError:
+        raise
+    except (RuntimeError, ValueError, TypeError, KeyError, OSError, MemoryError) as error:
+        raise broken(path, str(error)) from error
+    names = _exr_layer(list(channels))
+    if not names or len({channels[n].shape for n in names}) != 1:
+        raise broken(path, f"no colour channels among {', '.join(channels)}")
+    data = np.stack([channels[n].astype(np.float32) for n in names], axis=-1)
+    if data.shape[:2] == (h, w) and (dx, dy) == (0, 0):
+        return data, (h, w)
+    out = np.zeros((h, w, data.shape[2]), np.float32)
+    ys, xs = slice(max(dy, 0), min(dy + data.shape[0], h)), slice(max(dx, 0), min(dx + data.shape[1], w))
+    out[ys, xs] = data[ys.start - dy : ys.stop - dy, xs.start - dx : xs.stop - dx]
+    return out, (h, w)
+
+
+def _exr_layer(names: list[str]) -> list[str]:
+    """Channels of the picture in a file that may have layers: plain R G B, else the first layer that has them, else a lone channel."""
+    for prefix in dict.fromkeys(["", *(n.rsplit(".", 1)[0] + "." for n in names if "." in n)]):
+        if all(prefix + c in names for c in "RGB"):
+            return [prefix + c for c in "RGBA" if prefix + c in names]
+    for lone in ("Y", "Z", "V"):
+        if lone in names:
+            return [lone] + (["A"] if "A" in names else [])
+    return names[:1] if len(names) == 1 else []

@@ -1,0 +1,156 @@
+"""Reading pictures to linear float32."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image as PilImage
+from PIL import ImageOps
+
+from relit.conventions import linear_from_srgb
+from relit.images.decode import FLOAT, RAW, broken, checked, decode, exr, hdr_size, pil, rawpy
+from relit.images.write import codes_of
+
+FULL_FRAME_DIAGONAL = 43.2666  # mm, of the 36 x 24 mm film that "35 mm equivalent" focal lengths refer to
+
+
+@dataclass(frozen=True)
+class Image:
+    """A decoded picture, turned upright.
+
+    rgb: (H, W, 3) float32 linear Rec.709; composited on black (premultiplied) where the file has an alpha channel.
+    alpha: (H, W) float32 in [0, 1], or None. clipped: (H, W) bool, True where a code value is saturated; None for float formats.
+    """
+
+    rgb: np.ndarray
+    alpha: np.ndarray | None = None
+    clipped: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file says before it is decoded.
+
+    width, height: pixels, upright. alpha: has an alpha channel. focal: EXIF focal length in pixels, or None.
+    orientation: EXIF's, 1 to 8; from 5 on the sides of the stored picture are swapped.
+    """
+
+    width: int
+    height: int
+    alpha: bool = False
+    focal: float | None = None
+    orientation: int = 1
+
+    @property
+    def turned(self) -> bool:
+        return self.orientation >= 5
+
+
+def read_image(path: str | Path, upright: bool = True) -> Image:
+    """Decode a photo to linear float32, EXIF orientation applied once (or not at all with upright=False).
+
+    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed), EXR and HDR (linear already), HEIC and RAW with the optional extras.
+    Raises UserError for a missing, truncated, oversized or unknown file and for NaN or infinite pixels.
+    """
+    path = Path(path)
+    array, is_linear = decode(path, upright)
+    alpha, clipped = None, None
+    if array.ndim == 2:
+        array = array[..., None]
+    if array.shape[2] in (2, 4):
+        alpha = _unit(array[..., -1])
+        array = array[..., :-1]
+    if array.dtype.kind == "u":
+        clipped = (array == np.iinfo(array.dtype).max).any(axis=-1)
+    rgb = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
+    rgb = np.repeat(rgb, 3, axis=2) if rgb.shape[2] == 1 else rgb[..., :3]
+    if not is_linear:
+        rgb = linear_from_srgb(rgb)
+        if alpha is not None:  # coded formats store straight alpha, EXR premultiplied
+            rgb = rgb * alpha[..., None]
+    return Image(np.ascontiguousarray(rgb), alpha, clipped)
+
+
+def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image:
+    """A small version of `read_image` (longest side about `side` pixels) for looking at many photos quickly; linear, upright.
+
+    JPEG files are decoded at reduced size. Alpha is kept apart: rgb is NOT composited. `clipped` is None.
+    """
+    path = Path(path)
+    suffix = checked(path)
+    if suffix in FLOAT | RAW:
+        image = read_image(path, upright)
+        h, w = image.rgb.shape[:2]
+        size = (max(1, round(w * side / max(w, h))), max(1, round(h * side / max(w, h)))) if max(w, h) > side else (w, h)
+        alpha = None if image.alpha is None else cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA)
+        return Image(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), alpha)
+    with pil(path) as image:
+        try:
+            image.draft("RGB", (side, side))
+            has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+            if image.mode.startswith("I"):
+                codes = read_data(path)
+                image = PilImage.fromarray(codes_of(codes))
+            small = image.convert("RGBA" if has_alpha else "RGB")
+            small = ImageOps.exif_transpose(small) if upright else small
+            small = small.reduce(max(1, max(small.size) // side)) if max(small.size) >= 2 * side else small
+            array = _unit(np.array(small))
+        except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
+            raise broken(path, str(error)) from error
+    return Image(linear_from_srgb(array[..., :3]), array[..., 3] if has_alpha else None)
+
+
+def read_data(path: str | Path) -> np.ndarray:
+    """Decode without a transfer curve: (H, W) or (H, W, C) float32; 8/16-bit codes divided by their largest value. No alpha handling."""
+    array, _ = decode(Path(path))
+    array = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
+    return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+
+
+def read_header(path: str | Path) -> Header:
+    """Size, alpha and EXIF focal length without decoding the pixels. Raises UserError as `read_image` does."""
+    path = Path(path)
+    suffix = checked(path)
+    if suffix == ".exr":
+        channels, shape = exr(path, header_only=True)
+        return Header(shape[1], shape[0], any(c.split(".")[-1] == "A" for c in channels))
+    if suffix == ".hdr":
+        w, h = hdr_size(path)
+        return Header(w, h)
+    if suffix in RAW:
+        with rawpy().imread(str(path)) as raw:
+            w, h = (raw.sizes.height, raw.sizes.width) if raw.sizes.flip in (5, 6) else (raw.sizes.width, raw.sizes.height)
+        return Header(w, h)
+    with pil(path) as image:
+        w, h = image.size
+        # Pillow decodes a whole PNG to look for EXIF behind the pixels; what stands before them is enough here
+        exif = image.getexif() if image.format != "PNG" or "exif" in image.info else PilImage.Exif()
+        orientation = exif.get(0x0112, 1)
+        orientation = orientation if orientation in range(1, 9) else 1
+        w, h = (h, w) if orientation >= 5 else (w, h)
+        has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+        return Header(w, h, has_alpha, _focal(exif, w, h), orientation)
+
+
+def _focal(exif, width: int, height: int) -> float | None:
+    """Focal length in pixels from EXIF: the 35 mm equivalent (defined on the diagonal), else millimetres and focal-plane resolution."""
+    try:
+        ifd = exif.get_ifd(0x8769)
+        if float(ifd.get(0xA405, 0)) > 0:
+            return float(ifd[0xA405]) * float(np.hypot(width, height)) / FULL_FRAME_DIAGONAL
+        resolution, unit = float(ifd.get(0xA20E, 0)), {2: 25.4, 3: 10.0, 4: 1.0}.get(int(ifd.get(0xA210, 2)), 25.4)
+        focal = float(ifd.get(0x920A, 0)) * resolution / unit
+        return focal if focal > 0 and np.isfinite(focal) else None
+    except (ValueError, TypeError, ZeroDivisionError, KeyError, OSError, SyntaxError):
+        return None  # EXIF is a hint: a broken block is no reason to refuse the photo
+
+
+def _unit(codes: np.ndarray) -> np.ndarray:
+    """uint8 / uint16 codes -> float32 in [0, 1]; floats are clipped to it."""
+    if codes.dtype.kind == "u":
+        return codes.astype(np.float32) / np.float32(np.iinfo(codes.dtype).max)
+    return np.clip(codes.astype(np.float32), 0.0, 1.0)
