@@ -102,7 +102,7 @@ def with_cameras(capture: Capture, run: Run, job: Job) -> Capture:
         found, _ = find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=job.focal)
         return with_grabcut(found) if job.masks == "grabcut" else found
     with run.stage("cameras", title="cameras from photos") as stage:
-        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=job.focal)
+        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=job.focal, say=run.say)
     run.say(str(verdict))
     return with_grabcut(found) if job.masks == "grabcut" else found  # it is seeded by the object sphere, so it had to wait for the cameras
 

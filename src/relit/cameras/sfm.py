@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -73,10 +74,13 @@ class Verdict:
         return text + (f", because {self.reason}" if self.reason else "") + f"; mean reprojection error {self.mean_error:.2f} px"
 
 
-def find_cameras(capture: Capture, *, seed: int = 0, workdir: Path, focal: float | None = None) -> tuple[Capture, Verdict]:
+def find_cameras(
+    capture: Capture, *, seed: int = 0, workdir: Path, focal: float | None = None, say: Callable[[str], None] = lambda line: None
+) -> tuple[Capture, Verdict]:
     """Find the cameras of `capture.photos`; photos that could not be registered are left out with a note.
 
     focal: focal length in pixels of the photos as decoded (`Photo.width`), kept fixed; else EXIF's is refined, else it is found.
+    say: told what is being done, a line at a time.
     workdir: a folder of its own. The model found stays there: a second call with the same photos reads it instead of searching again.
     The frame is COLMAP's (arbitrary, scale as well).
     Raises UserError (exit code 4) when fewer than three photos can be registered.
@@ -100,11 +104,13 @@ def find_cameras(capture: Capture, *, seed: int = 0, workdir: Path, focal: float
     tries, best, features = [], None, {}
     with _quiet(pycolmap):
         for number, settings in enumerate(_plan(photos, capture, has_masks, focal)):
+            say(f"try {number + 1}: {settings.title}")
             found = _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_masks)
             took = " + ".join(f"{s:.0f}" for s in found.seconds)
             tries.append(
                 f"{settings.title}: {found.count} of {len(photos)}, {found.models} models ({took or 0} s: features, matching, mapping)"
             )
+            say(tries[-1])
             features = features or found.features
             if best is None or (found.count, -found.error) > (best.count, -best.error):
                 best, features = found, found.features
