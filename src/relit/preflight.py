@@ -32,7 +32,7 @@ def inspect(input: str | Path, job: Job, plot: Path | None = None) -> dict:
         "masks": mask_coverage(capture),
         "light": "one fixed light is assumed (multiview)",
         "notes": list(capture.notes),
-        "stages": ([] if capture.has_cameras else ["cameras"]) + ["volume", "surface", "asset", "report"],
+        "stages": ([] if capture.has_cameras else ["cameras"]) + ["volume", "mesh", "surface", "asset", "report"],
         "estimate": {"seconds": round(cost.seconds), "memory": round(cost.memory), "disk": round(cost.disk), "quality": job.quality},
     }
 

@@ -28,8 +28,8 @@ SIDE = 240  # pixels, longer side of a picture
 VIEWS = 4  # training photos that are compared
 HELD_OUT = 2  # photos that the fit has not seen
 STILLS = 12  # of the turntable
-SPP = 24  # samples a pixel of the turntable; the report is for looking, figures come from `relit evaluate`
-SPP_COMPARED = 64  # ... of what stands beside a photo
+SPP = 16  # samples a pixel of the turntable; the report is for looking, figures come from `relit evaluate`
+SPP_COMPARED = 48  # ... of what stands beside a photo
 BACKDROP = 0.18  # linear grey behind the object
 
 STYLE = f"""
@@ -148,7 +148,7 @@ def _turntables(asset: Asset) -> str:
     for name, light in lights.items():
         upright = rotate_environment(light, asset.world_from_asset)  # its top over the object's top
         scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, upright)
-        stills = [render(scene, c, spp=SPP, max_depth=4) for c in cameras]
+        stills = [render(scene, c, spp=SPP) for c in cameras]
         covered = np.concatenate([s[s[..., 3] > 0.5][:, :3].ravel() for s in stills])
         k = 0.9 / max(float(np.percentile(covered, 99)), 1e-6) if covered.size else 1.0
         strip = np.concatenate([s[..., :3] * k + BACKDROP * (1 - s[..., 3:]) for s in stills], axis=1)

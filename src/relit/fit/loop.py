@@ -16,15 +16,15 @@ class Adam:
         self.m, self.v = dr.zeros(mi.Float, size), dr.zeros(mi.Float, size)
         self.beta1, self.beta2, self.t = beta1, beta2, 0
 
-    def step(self, parameter, gradient, rate: float):
-        """The next value of `parameter` (Float, same size). rate: largest move of one entry per step."""
+    def step(self, parameter, gradient, rate: float, ratio=1.0):
+        """The next value of `parameter` (Float, same size). rate: largest move of one entry per step, times `ratio` (1 or Float, same size)."""
         self.t += 1
         b1, b2 = self.beta1, self.beta2
         size = dr.opaque(mi.Float, rate / (1 - b1**self.t))
         correction = dr.opaque(mi.Float, 1 / (1 - b2**self.t))
         self.m = b1 * self.m + (1 - b1) * gradient
         self.v = b2 * self.v + (1 - b2) * dr.square(gradient)
-        out = parameter - size * self.m / (dr.sqrt(self.v * correction) + 1e-12)
+        out = parameter - size * ratio * self.m / (dr.sqrt(self.v * correction) + 1e-12)
         dr.schedule(out, self.m, self.v)
         return out
 

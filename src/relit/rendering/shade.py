@@ -53,3 +53,26 @@ def shade(m: Marched, d, reflections):
     r = d - 2 * dr.dot(d, n) * n
     e = dr.exp(lookup_latlong(reflections, ROWS, COLUMNS, r))
     return dr.maximum(mi.Color3f(F[0], F[1], F[2]) + dr.maximum(F[3], 0) * e, 0), n
+
+
+def mean_radiance(grid, features: np.ndarray, reflections, points: np.ndarray) -> np.ndarray:
+    """(N, 3) radiance at surface points (N, 3), averaged over directions: what the features say, with the mean of the reflection map.
+
+    features: (rows, CHANNELS).
+    """
+    n = grid.n
+    at = (points.astype(np.float64) + 1) * (0.5 * (n - 1))
+    low = np.clip(np.floor(at).astype(np.int64), 0, n - 2)
+    f = at - low
+    index, values, weight = np.array(grid.index), np.zeros((len(points), CHANNELS)), np.zeros(len(points))
+    for corner in np.ndindex(2, 2, 2):
+        c = np.array(corner)
+        w = np.where(c, f, 1 - f).prod(1)
+        k = low + c
+        row = index[(k[:, 2] * n + k[:, 1]) * n + k[:, 0]]
+        w = np.where(row > 0, w, 0)  # nodes outside the band know nothing
+        values += w[:, None] * features[row]
+        weight += w
+    values /= np.maximum(weight, 1e-6)[:, None]
+    mirror = np.exp(np.array(reflections).reshape(ROWS, COLUMNS, 3)).mean((0, 1))
+    return np.maximum(values[:, :3] + np.maximum(values[:, 3:4], 0) * mirror, 1e-3).astype(np.float32)

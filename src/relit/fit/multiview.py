@@ -1,0 +1,263 @@
+"""Photos around an object under one fixed, unknown light -> a relightable asset. The recipe of the `multiview` capture.
+
+    photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
+    hull       visual hull of the masks, or a ball without masks
+    volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
+    mesh       zero level set, decimated; texture atlas; mean radiance per vertex
+    surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/surface.py
+    asset      textures with filled gutters, everything back in the frame of the user's cameras
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from relit.conventions import move_points, move_pose, similarity
+from relit.errors import UserError, did_you_mean
+from relit.fit.pixels import PixelBank, make_bank
+from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.geometry.atlas import unwrap
+from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
+from relit.geometry.hull import ball, visual_hull
+from relit.geometry.mesh import extract_mesh
+from relit.geometry.sdf import dense_values, row_features
+from relit.materials.field import pictures
+from relit.materials.intrinsic import base_without_shading
+from relit.rendering.background import start_background
+from relit.rendering.shade import mean_radiance
+from relit.rendering.transport import TraceableMesh
+from relit.scene import Asset, Camera, Capture, Material, Mesh
+
+
+@dataclass(frozen=True)
+class MultiviewOptions:
+    """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. max_pixels: photos are
+    shrunk until all together have no more. refine_cameras: step of the camera corrections in the volume pass (0: cameras are exact).
+    normal: weight of normal priors read from files. background: nodes a side of the background field for photos without masks.
+    faces: of the mesh, about. texture: texels a side. surface_steps, points, directions: steps of the surface pass, pixels per step,
+    directions per pixel. light: rows of the environment map.
+    """
+
+    levels: tuple[int, ...] = (64, 128, 192)
+    level_steps: tuple[int, ...] = (250, 350, 300)
+    rays: int = 8192
+    max_pixels: int = 24_000_000
+    refine_cameras: float = 0.0
+    normal: float = 0.05
+    background: int = 64
+    faces: int = 40_000
+    texture: int = 512
+    surface_steps: int = 700
+    points: int = 4096
+    directions: int = 64
+    light: int = 64
+
+
+PRESETS = {
+    "draft": {
+        "levels": (48, 96),
+        "level_steps": (150, 180),
+        "rays": 4096,
+        "max_pixels": 8_000_000,
+        "background": 48,
+        "faces": 12_000,
+        "texture": 256,
+        "surface_steps": 200,
+        "points": 2048,
+        "light": 32,
+    },
+    "standard": {},
+    "high": {
+        "levels": (64, 128, 256),
+        "level_steps": (400, 600, 800),
+        "max_pixels": 60_000_000,
+        "background": 96,
+        "faces": 60_000,
+        "texture": 1024,
+        "surface_steps": 2500,
+    },
+}
+
+
+def options_for(quality: str) -> MultiviewOptions:
+    """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
+    if quality not in PRESETS:
+        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
+    return MultiviewOptions(**PRESETS[quality])
+
+
+def volume_options(o: MultiviewOptions) -> VolumeOptions:
+    return VolumeOptions(o.levels, o.level_steps, o.rays, refine_cameras=o.refine_cameras, normal=o.normal)
+
+
+def surface_options(o: MultiviewOptions) -> SurfaceOptions:
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light)
+
+
+def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0) -> Asset:
+    """Run all stages of the recipe in the run folder; stages that are done are read back. `capture` has cameras and an object sphere."""
+    if not capture.has_cameras or capture.sphere is None:
+        raise ValueError("reconstruct needs cameras and the object sphere")
+    if len(options.levels) != len(options.level_steps):
+        raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
+    world_from_unit = capture.sphere.world_from_unit
+    bank, cameras, masks, level = load_pixels(capture, options, run)
+
+    if run.done("mesh"):
+        parts = run_arrays(run, "mesh", "mesh")
+    else:
+        model = volume_stage(bank, cameras, masks, level, run, options, seed)
+        parts = mesh_stage(model, run, options)
+    mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
+
+    if run.done("surface"):
+        maps = run_arrays(run, "surface", "maps")
+    else:
+        maps = surface_stage(bank, mesh, parts["radiance"], run, options, seed)
+    return assemble(capture, mesh, maps, world_from_unit)
+
+
+def load_pixels(capture: Capture, options: MultiviewOptions, run):
+    """Decode all photos: the pixel bank, cameras (unit frame), masks or None, mean radiance of the object (3,)."""
+    unit_from_world = np.linalg.inv(capture.sphere.world_from_unit)
+    total = sum(p.width * p.height for p in capture.photos)
+    shrink = min(1.0, np.sqrt(options.max_pixels / total))
+    if shrink < 1:
+        run.say(f"photos are used at {shrink:.0%} of their size (all together {options.max_pixels / 1e6:.0f} megapixels; --set max_pixels=N)")
+    cameras, images, masks, normals = [], [], [], []
+    for photo in capture.photos:
+        pixels, camera = photo.load(), photo.camera
+        rgb, mask, normal = pixels.rgb, pixels.mask, pixels.normal
+        if shrink < 1:
+            w, h = max(16, round(camera.width * shrink)), max(16, round(camera.height * shrink))
+            rgb, mask, normal = (resize(a, w, h) for a in (rgb, mask, normal))
+            camera = camera.resized(w, h)
+        cameras.append(camera.with_pose(move_pose(unit_from_world, camera.world_from_camera)))
+        images.append(rgb)
+        masks.append(mask)
+        normals.append(normal)
+    if any(m is None for m in masks) and not all(m is None for m in masks):
+        run.say("note: some photos have no mask; all photos are used without masks")
+        masks = [None] * len(masks)
+    masked = masks[0] is not None
+    weight = sum(float(m.sum()) for m in masks) if masked else sum(i.shape[0] * i.shape[1] for i in images)
+    level = sum((i * (m[..., None] if masked else 1)).sum((0, 1)) for i, m in zip(images, masks)) / max(weight, 1e-6)
+    prior = normals if any(n is not None for n in normals) else None
+    bank = make_bank(cameras, images, masks, prior)
+    return bank, cameras, masks if masked else None, np.maximum(level, 1e-3)
+
+
+def resize(image, width: int, height: int):
+    """Area-averaged (H, W[, C]) float32, or None for None."""
+    import cv2
+
+    return None if image is None else cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, options: MultiviewOptions, seed: int) -> VolumeModel:
+    """Hull and volume pass."""
+    with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
+        n = options.levels[0]
+        if masks is not None:
+            try:
+                values = visual_hull(cameras, masks, n)
+            except ValueError:
+                raise UserError(
+                    "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
+                    "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
+                    "look at `relit inspect INPUT`; give --sphere X Y Z RADIUS, or --masks none to do without masks",
+                    code=4,
+                ) from None
+            model = start_model(values, level, None, full=False)
+        else:
+            background = start_background(options.background, level)
+            model = start_model(ball(n, 0.5), level, background, full=True)
+        fit_volume(bank, model, volume_options(options), stage, seed)
+    return model
+
+
+def mesh_stage(model: VolumeModel, run, options: MultiviewOptions) -> dict[str, np.ndarray]:
+    """Mesh, atlas, and the mean radiance of each vertex. Returns (and keeps) vertices, faces, normals, uvs, radiance."""
+    with run.stage("mesh", title="mesh and atlas") as stage:
+        values = dense_values(model.grid)
+        mesh, how = unwrap(extract_mesh(values, faces=options.faces), options.texture)
+        if how != "xatlas":
+            run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
+        parts = {
+            "vertices": mesh.vertices,
+            "faces": mesh.faces,
+            "normals": mesh.normals,
+            "uvs": mesh.uvs,
+            "radiance": mean_radiance(model.grid, row_features(model.grid), model.reflections, mesh.vertices),
+        }
+        stage.save("mesh", **parts)
+    return parts
+
+
+def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, options: MultiviewOptions, seed: int) -> dict[str, np.ndarray]:
+    """Material and light. Returns (and keeps) base_color, roughness, metallic, environment (unit frame), f0."""
+    o = surface_options(options)
+    with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
+        face, bary = rasterise_atlas(mesh, o.texture)
+        known = face >= 0
+        areas = vertex_areas(mesh)
+        guess = base_without_shading(radiance, mesh.normals, areas)
+        start = fill_gutters(interpolate(guess, mesh.faces, face, bary), known)
+        mean = float((radiance * areas[:, None]).sum() / areas.sum() / 3)
+        model = start_surface(start, known, mean, o)
+        fit_surface(bank, TraceableMesh(mesh, radiance), model, o, stage, seed)
+        base, roughness, metallic = pictures(model.material)
+        maps = {
+            "base_color": fill_gutters(base, known),
+            "roughness": fill_gutters(roughness, known),
+            "metallic": fill_gutters(metallic, known),
+            "environment": model.environment.image(),
+            "f0": np.array(model.material.f0),
+        }
+        stage.save("maps", **maps)
+    return maps
+
+
+def vertex_areas(mesh: Mesh) -> np.ndarray:
+    """(V,) a third of the area of the faces around each vertex."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    out = np.zeros(len(mesh.vertices))
+    np.add.at(out, mesh.faces.ravel(), np.repeat(area, 3))
+    return out
+
+
+def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_from_unit: np.ndarray) -> Asset:
+    """The asset: +Y up where the capture knows its up direction; lengths in the units of the user's cameras."""
+    up = np.array([0.0, 1.0, 0.0]) if capture.up is None else np.asarray(capture.up, np.float64)
+    world_from_asset = similarity(rotation_from_y(up), capture.sphere.centre)
+    asset_from_unit = np.linalg.inv(world_from_asset) @ world_from_unit
+    rotation = asset_from_unit[:3, :3] / np.cbrt(np.linalg.det(asset_from_unit[:3, :3]))
+    placed = replace(
+        mesh,
+        vertices=move_points(asset_from_unit, mesh.vertices).astype(np.float32),
+        normals=(mesh.normals @ rotation.T).astype(np.float32),
+    )
+    material = Material(maps["base_color"], maps["roughness"], maps["metallic"])
+    cameras = tuple((p.name, p.camera) for p in capture.photos)
+    return Asset(placed, material, world_from_asset, maps["environment"], cameras, {})
+
+
+def rotation_from_y(up: np.ndarray) -> np.ndarray:
+    """The shortest rotation (3, 3) that carries +Y to `up`."""
+    y, u = np.array([0.0, 1.0, 0.0]), up / np.linalg.norm(up)
+    axis, cosine = np.cross(y, u), float(y @ u)
+    if cosine < -0.999999:
+        return np.diag([1.0, -1.0, -1.0])
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + k + k @ k / (1 + cosine)
+
+
+def run_arrays(run, stage: str, name: str) -> dict[str, np.ndarray]:
+    """Arrays that a finished stage has kept."""
+    from relit.files import load_arrays
+
+    return load_arrays(run.folder / "stages" / stage / f"{name}.npz")

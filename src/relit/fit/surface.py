@@ -1,0 +1,193 @@
+"""The surface pass: metallic-roughness textures and the environment light, by Monte Carlo light transport on the mesh.
+
+Each step takes a few thousand pixels of all photos, traces many directions at each (rendering/transport.py) and moves material texels
+and light texels. Shape is fixed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.losses import weighted_mean
+from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.lighting.environment import Environment
+from relit.materials.field import MaterialField, material_at, project, start_material
+from relit.rendering.transport import Points, TraceableMesh, first_hits, reflected, sample_lights
+
+ALBEDO_START = 0.4  # mean base colour at the start; light and albedo share one unknown scale
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """steps, points (pixels per step), directions (per point). texture: texels a side. light: rows of the environment (twice as many columns).
+
+    colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step. The other
+    fields weigh terms. warm: part of the steps over which colour_rate rises. smooth_* between similar neighbours (see `similarity`), metallic_binary m (1 - m), metallic_sparse m, light_smooth (total variation of the
+    log radiance), light_neutral (its chroma).
+    """
+
+    steps: int = 700
+    points: int = 4096
+    directions: int = 64
+    texture: int = 512
+    light: int = 64
+    colour_rate: float = 0.01
+    roughness_rate: float = 0.02
+    metallic_rate: float = 0.02
+    light_rate: float = 0.05
+    warm: float = 0.3
+    smooth_roughness: float = 0.05
+    smooth_metallic: float = 0.05
+    smooth_colour: float = 0.05
+    similarity_reach: float = 0.15
+    similarity_width: float = 0.1
+    metallic_binary: float = 0.01
+    metallic_sparse: float = 0.01
+    light_smooth: float = 0.002
+    light_neutral: float = 0.002
+
+
+@dataclass
+class SurfaceModel:
+    """material: the textures. log_light: Float [rows * 2 rows * 3], log radiance, lat-long in the unit frame. environment: exp of it."""
+
+    material: MaterialField
+    log_light: Any
+    environment: Environment
+
+
+def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions) -> SurfaceModel:
+    """base: (S, S, 3) first guess of the base colour up to scale (materials.intrinsic), known: (S, S) bool, radiance: mean over the object.
+
+    The light starts grey and even, bright enough that the mean base colour is ALBEDO_START.
+    """
+    mean = float(base[known].mean())
+    albedo = np.clip(base * (ALBEDO_START / max(mean, 1e-6)), 0.02, 0.95)
+    material = start_material(options.texture, albedo, 0.5, 0.1)
+    h = options.light
+    log_light = mi.Float(np.full(h * 2 * h * 3, np.log(max(radiance, 1e-4) / ALBEDO_START), np.float32))
+    return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h))
+
+
+def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, options: SurfaceOptions, stage, seed: int = 0) -> SurfaceModel:
+    """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when there is one."""
+    material, environment = model.material, model.environment
+    first = 0
+    saved = stage.load("checkpoint")
+    if saved:
+        first = int(saved["step"])
+        material.colour, material.metallic = mi.Float(saved["colour"]), mi.Float(saved["metallic"])
+        model.log_light = mi.Float(saved["light"])
+    environment.radiance = dr.exp(model.log_light)
+    environment.rebuild()
+    count = options.points
+    rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
+    adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, model.log_light))
+    ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
+    ratio = mi.Float(ratio)
+
+    def step(i: int) -> dict:
+        decay = cosine_decay(i / options.steps, 0.05)
+        warm = min(1.0, 0.05 + (i / (options.warm * options.steps)) ** 2)  # the light first: base colour could explain all shading at once
+        pixel = draw_pixels(bank, rng, count)
+        dr.eval(pixel, rng)
+        batch = batch_of(bank, pixel)
+        points = first_hits(mesh, batch.o, batch.d)
+        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
+        points.valid = valid
+        dr.eval(points, batch.rgb)
+        near = neighbours(mesh, points, options.similarity_reach, rng)
+        dr.eval(near, rng)
+        with dr.suspend_grad():
+            start = material_at(material, points.uv, valid)
+            dr.eval(start.base, start.roughness, start.metallic)
+        lights = sample_lights(mesh, points, start, environment, options.directions, rng)
+
+        params = [material.colour, material.metallic, model.log_light]
+        dr.enable_grad(*params)
+        environment.radiance = dr.exp(model.log_light)
+        surface = material_at(material, points.uv, valid)
+        a, b = reflected(points, lights, surface, environment)
+        fit = dual_loss(a, b, batch.rgb, valid)
+        prior = material_prior(material, surface, near, valid, options) + light_prior(model.log_light, options)
+        dr.backward(fit + prior)
+        gradients = [dr.grad(p) for p in params]
+        dr.disable_grad(*params)
+        dr.eval(gradients, fit)
+        material.colour = adam_colour.step(dr.detach(material.colour), gradients[0], options.colour_rate * decay * warm, ratio)
+        material.metallic = adam_metallic.step(dr.detach(material.metallic), gradients[1], options.metallic_rate * decay)
+        model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * decay)
+        project(material)
+        dr.eval(model.log_light, material.colour, material.metallic)
+        environment.radiance = dr.exp(model.log_light)
+        dr.eval(environment.radiance)
+        environment.rebuild()
+        return {"colour": fit}
+
+    def state() -> dict:
+        return {"colour": np.array(material.colour), "metallic": np.array(material.metallic), "light": np.array(model.log_light)}
+
+    run_steps(stage, first, options.steps, step, state)
+    return model
+
+
+def dual_loss(a, b, target, valid, eps: float = 0.1):
+    """Mean of ((a - L*)(b - L*)) / (sg(L) + eps)^2 over points and channels, a and b independent estimates of L: unbiased for the squared
+    relative error. A pixel whose file value is saturated only says "at least this bright". Outliers lose weight (Geman-McClure)."""
+    mean = dr.detach((a + b) * 0.5)
+    scale = 1 / (mi.Color3f(mean) + eps)
+    ra, rb = (a - target) * scale, (b - target) * scale
+    r = dr.detach((ra + rb) * 0.5)
+    weight = 1 / dr.square(1 + dr.square(r))
+    open_ended = (target >= 0.99) & (mean > target)
+    value = dr.select(open_ended, 0, ra * rb * weight)
+    return weighted_mean((value.x + value.y + value.z) / 3, dr.select(valid, mi.Float(1), 0))
+
+
+def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points:
+    """For each point another one on the same stretch of surface, up to `reach` away (log-uniform distance in its tangent plane). Detached."""
+    with dr.suspend_grad():
+        phi = dr.two_pi * rng.next_float32()
+        r = reach * dr.exp(-4 * rng.next_float32())
+        frame = mi.Frame3f(points.n)
+        offset = (frame.s * dr.cos(phi) + frame.t * dr.sin(phi)) * r
+        return first_hits(mesh, points.x + offset + points.n * r, -points.n)
+
+
+def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions):
+    """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour and normal should share
+    roughness, metallic and, more strictly, base colour."""
+    other = material_at(material, near.uv, near.valid)
+    difference = dr.detach(other.base - surface.base)
+    alike = dr.exp(-dr.squared_norm(mi.Vector3f(difference)) / (2 * options.similarity_width**2))
+    w = dr.select(valid & near.valid, alike, 0)
+    change = dr.abs(other.base - surface.base)
+    smooth = (
+        options.smooth_roughness * dr.abs(other.roughness - surface.roughness)
+        + options.smooth_metallic * dr.abs(other.metallic - surface.metallic)
+        + options.smooth_colour * (change.x + change.y + change.z) * w
+    )
+    m = surface.metallic
+    single = options.metallic_binary * m * (1 - m) + options.metallic_sparse * m
+    return dr.mean(smooth * w) + dr.mean(dr.select(valid, single, 0))
+
+
+def light_prior(log_light, options: SurfaceOptions):
+    """Total variation of the log radiance over the lat-long map, and its chroma (difference from grey)."""
+    h, w = options.light, 2 * options.light
+    i = dr.arange(mi.UInt32, h * w)
+    row, column = i // w, i % w
+    here = dr.gather(mi.Color3f, log_light, i)
+    right = dr.gather(mi.Color3f, log_light, row * w + (column + 1) % w)
+    below = dr.gather(mi.Color3f, log_light, dr.minimum(row + 1, h - 1) * w + column)
+    area = dr.sin((mi.Float(row) + 0.5) * (dr.pi / h))
+    soft = lambda c: dr.sqrt(dr.squared_norm(mi.Vector3f(c)) + 1e-4)  # noqa: E731
+    grey = (here.x + here.y + here.z) / 3
+    chroma = dr.squared_norm(mi.Vector3f(here - grey))
+    return options.light_smooth * dr.mean((soft(right - here) + soft(below - here)) * area) + options.light_neutral * dr.mean(chroma * area)

@@ -1,0 +1,64 @@
+"""Material textures as flat Dr.Jit arrays: look-up with gradients, and the way back to pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.materials.brdf import Surface
+
+MIN_ROUGHNESS = 0.08  # brdf.MIN_ALPHA
+
+
+@dataclass
+class MaterialField:
+    """Square textures of `size` texels a side. colour: Float [size^2 * 4], linear base colour and roughness. metallic: Float [size^2]."""
+
+    size: int
+    colour: Any
+    metallic: Any
+    f0: float = 0.04
+
+
+def start_material(size: int, base: np.ndarray, roughness: float, metallic: float, f0: float = 0.04) -> MaterialField:
+    """base: (size, size, 3) linear start of the base colour."""
+    colour = np.concatenate([base, np.full((size, size, 1), roughness)], -1).astype(np.float32)
+    return MaterialField(size, mi.Float(colour.ravel()), mi.Float(np.full(size * size, metallic, np.float32)), f0)
+
+
+def texels_at(field: MaterialField, uv):
+    """The four texels around uv (Point2f): flat indices and bilinear weights."""
+    s = field.size
+    x, y = dr.clip(uv.x * s - 0.5, 0, s - 1.001), dr.clip(uv.y * s - 0.5, 0, s - 1.001)
+    x0, y0 = mi.UInt32(x), mi.UInt32(y)
+    fx, fy = x - mi.Float(x0), y - mi.Float(y0)
+    i = y0 * s + x0
+    return [(i, (1 - fx) * (1 - fy)), (i + 1, fx * (1 - fy)), (i + s, (1 - fx) * fy), (i + s + 1, fx * fy)]
+
+
+def material_at(field: MaterialField, uv, active=True) -> Surface:
+    """Bilinear look-up; differentiable in field.colour and field.metallic."""
+    colour, metallic = mi.Vector4f(0), mi.Float(0)
+    for i, w in texels_at(field, uv):
+        colour = dr.fma(dr.gather(mi.Vector4f, field.colour, i, active), w, colour)
+        metallic = dr.fma(dr.gather(mi.Float, field.metallic, i, active), w, metallic)
+    return Surface(mi.Color3f(colour.x, colour.y, colour.z), colour.w, metallic, field.f0)
+
+
+def project(field: MaterialField) -> None:
+    """Clip every texel to what a material may be: colour and metallic in [0, 1], roughness in [MIN_ROUGHNESS, 1]."""
+    n = dr.width(field.colour)
+    low = dr.select(dr.arange(mi.UInt32, n) % 4 == 3, mi.Float(MIN_ROUGHNESS), mi.Float(0.0))
+    field.colour = dr.clip(field.colour, low, 1)
+    field.metallic = dr.clip(field.metallic, 0, 1)
+    dr.schedule(field.colour, field.metallic)
+
+
+def pictures(field: MaterialField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Base colour (S, S, 3), roughness (S, S), metallic (S, S), float32."""
+    c = np.array(field.colour).reshape(field.size, field.size, 4)
+    return c[..., :3].copy(), c[..., 3].copy(), np.array(field.metallic).reshape(field.size, field.size)

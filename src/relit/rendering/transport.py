@@ -1,0 +1,160 @@
+"""Monte Carlo light transport on a mesh under an environment: what the surface pass differentiates.
+
+SfD Eq. (3): L_o(w_o; x) = ∫ L_i(w_i) f_r(w_i, w_o; x) (w_i·n) dw_i, with many directions at each of few surface points. Half of the
+directions follow the light, half the BRDF (balance heuristic over the mixture). Visibility is traced. Where a direction is blocked, the light
+that arrives is the radiance of the surface that blocks it: the mean radiance that the photos show there, so every inter-reflection
+is in it, and it is a constant of the fit. Directions, visibility and densities are detached (no boundary term: this pass cannot
+move silhouettes or shadow edges).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.lighting.environment import Environment
+from relit.materials.brdf import Surface, evaluate, pdf, sample
+from relit.rendering.mitsuba_scene import build_geometry
+from relit.rendering.path import SmoothOrigins
+from relit.scene import Mesh
+
+OFFSET = 1e-3  # of the unit frame, along the normal
+
+
+class TraceableMesh:
+    """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray queries."""
+
+    def __init__(self, mesh: Mesh, radiance: np.ndarray):
+        self.scene = build_geometry(mesh)
+        self.origins = SmoothOrigins(mesh)
+        self.faces, self.normals = self.origins.faces, self.origins.normals
+        self.uvs = mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel())
+        self.radiance = mi.Float(np.ascontiguousarray(radiance, np.float32).ravel())
+
+
+@dataclass
+class Points:
+    """Surface points seen along rays. valid: Bool. x: Point3f on the smooth surface. n: Vector3f unit shading normal. geometric: Vector3f.
+    v: Vector3f to the viewer. uv: Point2f, v = 0 at the top row of textures."""
+
+    valid: Any
+    x: Any
+    n: Any
+    geometric: Any
+    v: Any
+    uv: Any
+
+
+def first_hits(mesh: TraceableMesh, o, d) -> Points:
+    """Where rays (o, d) meet the mesh from outside. Detached."""
+    with dr.suspend_grad():
+        ray = mi.Ray3f(mi.Point3f(o), d)
+        pi = mesh.scene.ray_intersect_preliminary(ray, coherent=False)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        hit = si.is_valid()
+        b = (1 - pi.prim_uv.x - pi.prim_uv.y, pi.prim_uv.x, pi.prim_uv.y)
+        corner = [dr.gather(mi.UInt32, mesh.faces, pi.prim_index * 3 + k, hit) for k in range(3)]
+        n = sum(b[k] * dr.gather(mi.Vector3f, mesh.normals, corner[k], hit) for k in range(3))
+        n = dr.select(hit, dr.normalize(n), mi.Vector3f(0, 0, 1))  # a miss must not become a NaN that meets a zero weight
+        uv = sum(b[k] * dr.gather(mi.Point2f, mesh.uvs, corner[k], hit) for k in range(3))
+        x = dr.select(hit, mi.Point3f(mesh.origins.shifted(si, pi.prim_uv, hit)), 0)
+        return Points(hit & (dr.dot(si.n, d) < 0), x, n, dr.select(hit, mi.Vector3f(si.n), mi.Vector3f(0, 0, 1)), -mi.Vector3f(d), uv)
+
+
+@dataclass
+class Lights:
+    """`count` directions for each point, point-major. l: Vector3f. weight: Float, 1 / (count * density), 0 where a direction is useless.
+    visible: Float, 1 where nothing blocks. blocked: Color3f, radiance of the blocker, 0 where visible. point: UInt32."""
+
+    count: int
+    l: Any
+    weight: Any
+    visible: Any
+    blocked: Any
+    point: Any
+
+
+def low_discrepancy(count: int) -> np.ndarray:
+    """(count, 3) points of the R3 sequence (Roberts 2018)."""
+    g = 1.2207440846057596
+    return ((np.arange(count)[:, None] + 0.5) * np.array([1 / g, 1 / g**2, 1 / g**3]) % 1.0).astype(np.float32)
+
+
+def sample_lights(mesh: TraceableMesh, points: Points, surface: Surface, environment: Environment, count: int, rng) -> Lights:
+    """Draw and trace `count` (a multiple of 4) directions per point. rng: PCG32 with one lane per point. Detached."""
+    with dr.suspend_grad():
+        total = dr.width(points.x)
+        quarter = count // 4
+        base = mi.Float(low_discrepancy(quarter).T.ravel())
+        shifts = [mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32()) for _ in range(4)]
+        dr.eval(shifts, rng)
+        index = dr.arange(mi.UInt32, total * count)
+        point, j = index // count, index % count
+        odd, k = (j & 1) == 1, j >> 1
+        from_light = k < quarter
+        k = dr.select(from_light, k, k - quarter)
+        s = [dr.gather(mi.Vector3f, c, point) for c in shifts]  # independent for the even and the odd half, and for the two strategies
+        s = dr.select(odd, dr.select(from_light, s[0], s[1]), dr.select(from_light, s[2], s[3]))
+        u = [dr.gather(mi.Float, base, k + quarter * c) for c in range(3)]
+        u = [dr.minimum(a - dr.floor(a), 0.9999999) for a in (u[0] + s.x, u[1] + s.y, u[2] + s.z)]
+        n, v = dr.gather(mi.Vector3f, points.n, point), dr.gather(mi.Vector3f, points.v, point)
+        m = surface_at(surface, point)
+        l_light, _ = environment.sample(mi.Point2f(u[0], u[1]))
+        l_brdf = sample(m, n, v, u[2], mi.Point2f(u[0], u[1]))
+        l = dr.select(from_light, l_light, l_brdf)
+        density = 0.5 * environment.pdf(l) + 0.5 * pdf(m, n, v, l)
+        useful = (dr.dot(n, l) > 0) & dr.gather(mi.Bool, points.valid, point)
+        weight = dr.select(useful, 1 / (count * dr.maximum(density, 1e-6)), 0)
+        g = dr.gather(mi.Vector3f, points.geometric, point)
+        x = dr.gather(mi.Point3f, points.x, point) + g * OFFSET
+        ray = mi.Ray3f(x, l)
+        pi = mesh.scene.ray_intersect_preliminary(ray, coherent=False, active=useful)
+        hit = pi.is_valid() & useful
+        b = (1 - pi.prim_uv.x - pi.prim_uv.y, pi.prim_uv.x, pi.prim_uv.y)
+        corner = [dr.gather(mi.UInt32, mesh.faces, pi.prim_index * 3 + c, hit) for c in range(3)]
+        blocked = mi.Color3f(0)
+        for c in range(3):
+            blocked += b[c] * dr.gather(mi.Color3f, mesh.radiance, corner[c], hit)
+        blocked = dr.select(hit, blocked, 0)
+        out = Lights(count, l, weight, dr.select(hit, mi.Float(0), 1), blocked, point)
+        dr.eval(out.l, out.weight, out.visible, out.blocked, out.point)
+        return out
+
+
+def surface_at(surface: Surface, point) -> Surface:
+    """The material of each direction's point."""
+    return Surface(
+        dr.gather(mi.Color3f, surface.base, point),
+        dr.gather(mi.Float, surface.roughness, point),
+        dr.gather(mi.Float, surface.metallic, point),
+        surface.f0,
+    )
+
+
+def reflected(points: Points, lights: Lights, surface: Surface, environment: Environment):
+    """Radiance towards the viewer (two Color3f, estimated from the even and from the odd directions of each point).
+
+    Differentiable in the surface's material and in environment.radiance. The product of the two residuals is an unbiased estimate of the
+    squared error; the square of one estimate would pull towards materials with less noise.
+    """
+    point = lights.point
+    n, v = dr.gather(mi.Vector3f, points.n, point), dr.gather(mi.Vector3f, points.v, point)
+    m = Surface(*[repeat(c, lights.count) for c in (surface.base, surface.roughness, surface.metallic)], surface.f0)
+    arriving = environment.eval(lights.l) * lights.visible + lights.blocked
+    value = evaluate(m, n, v, lights.l) * arriving * (2 * lights.weight)
+    odd = (dr.arange(mi.UInt32, dr.width(lights.weight)) & 1) == 1
+    zero = mi.Color3f(0)
+    first, second = dr.select(odd, zero, value), dr.select(odd, value, zero)
+    total = lambda c: mi.Color3f(*[dr.block_sum(k, lights.count) for k in (c.x, c.y, c.z)])  # noqa: E731
+    return total(first), total(second)
+
+
+def repeat(value, count: int):
+    """Each entry `count` times; the adjoint is a block sum, not a scatter."""
+    if isinstance(value, mi.Float):
+        return dr.repeat(value, count)
+    return type(value)(*[dr.repeat(c, count) for c in value])
