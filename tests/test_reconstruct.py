@@ -130,7 +130,7 @@ def test_inspect_changes_nothing(capsys, capture):
     before = sorted(capture.rglob("*"))
     code, out, _ = relit(capsys, "inspect", capture, "--json", "--quality", "high")
     found = json.loads(out)
-    assert code == 0 and found["stages"] == ["volume", "surface", "asset", "report"] and found["estimate"]["quality"] == "high"
+    assert code == 0 and found["stages"] == ["volume", "mesh", "surface", "asset", "report"] and found["estimate"]["quality"] == "high"
     assert before == sorted(capture.rglob("*"))
 
 

@@ -95,20 +95,25 @@ class Cost:
     disk: float
 
 
-# Measured on 2 cores at 60 photos of 400x400: (seconds, bytes) by quality, and what each photo adds.
-BASE = {"draft": (60.0, 1.0e9), "standard": (280.0, 1.6e9), "high": (900.0, 2.8e9)}
+# Measured on 2 cores at 36 photos of 256x256 and rounded up: (seconds, bytes) by quality, and what photos add.
+BASE = {"draft": (45.0, 0.7e9), "standard": (220.0, 1.2e9), "high": (1000.0, 2.5e9)}
 SECONDS_PER_PHOTO = {"cameras": 3.0, "load": 0.05}
-BYTES_PER_PIXEL = 24.0  # colour, mask and index of the pixel bank, and one decoded photo at a time
+BYTES_PER_PIXEL = 40.0  # a decoded photo and its share of the pixel bank
 
 
-def estimate(capture: Capture, job: Job) -> Cost:
-    """Forecast from the number of photos, their pixels and the quality; before the job, so that it can be refused."""
+def estimate(capture: Capture, job: Job, max_pixels: int | None = None) -> Cost:
+    """Forecast from the number of photos, their pixels and the quality; before the job, so that it can be refused.
+
+    max_pixels: the recipe shrinks the photos until all together have no more (None: it does not).
+    """
     pixels = sum(p.width * p.height for p in capture.photos)
+    pixels = pixels if max_pixels is None else min(pixels, max_pixels)
     seconds, memory = BASE[job.quality]
     seconds += len(capture.photos) * SECONDS_PER_PHOTO["load"]
     if not capture.has_cameras:
         seconds += len(capture.photos) * SECONDS_PER_PHOTO["cameras"]
-    return Cost(seconds, memory + BYTES_PER_PIXEL * pixels, 0.3e9 + (0.4e9 if job.quality == "high" else 0))
+    largest = max((p.width * p.height for p in capture.photos), default=0)
+    return Cost(seconds, memory + BYTES_PER_PIXEL * (pixels + 2 * largest), 0.1e9 if job.quality == "draft" else 0.3e9)
 
 
 def check_memory(cost: Cost, device: str) -> None:

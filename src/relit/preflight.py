@@ -18,7 +18,9 @@ def inspect(input: str | Path, job: Job, plot: Path | None = None) -> dict:
     capture = open_input(Path(input), job)
     if plot is not None:
         write_plot(plot, capture)
-    cost = estimate(capture, job)
+    from relit.fit.multiview import options_for
+
+    cost = estimate(capture, job, options_for(job.quality).max_pixels)
     sizes = sorted({(p.width, p.height) for p in capture.photos})
     ball = capture.sphere and {"centre": [float(x) for x in capture.sphere.centre], "radius": float(capture.sphere.radius)}
     return {

@@ -49,7 +49,7 @@ def reconstruct(
     options = with_values(options_for(job.quality), from_file, f"--config {config}")
     options = with_values(with_pairs(options, pairs), settings or {}, "settings")
     capture = open_input(Path(input), job)
-    cost = estimate(capture, job)
+    cost = estimate(capture, job, options.max_pixels)
     check_memory(cost, chosen)
     record = {"input": Path(input).resolve().name, **dataclasses.asdict(job), "capture": kind, "settings": dataclasses.asdict(options)}
     with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
