@@ -54,7 +54,7 @@ def demo(out: str | Path, *, device: str = "auto", quality: str = "draft", overw
     )
     log.say("2 of 4  reconstructing shape, material and light from the photos")
     run = out / "run"
-    reconstruct(out / "capture", run, device=device, quality=quality, overwrite=overwrite)
+    reconstruct(out / "capture", run, device=device, quality=quality, overwrite=overwrite, report=False)
     log.say("3 of 4  scoring against the truth")
     result = evaluate(run, out / "capture", spp=TEST_SPP)
     write_text(run / "evaluation.json", json.dumps(result, indent=1) + "\n")

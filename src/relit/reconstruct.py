@@ -28,12 +28,13 @@ def reconstruct(
     settings: dict | None = None,
     config: str | Path | None = None,
     overwrite: bool = False,
+    report: bool = True,
     **flags,
 ) -> Path:
     """Photos -> `out`/asset; returns the asset folder. Giving the same call again resumes or finds it done.
 
     flags: the fields of `Job`; None means not given. config: a TOML file whose values stand where no flag was given. pairs: 'key=value'
-    texts, settings: {key: value}, both for the fields of `relit.fit.multiview.MultiviewOptions`.
+    texts, settings: {key: value}, both for the fields of `relit.fit.multiview.MultiviewOptions`. report: write report.html as well.
     Raises UserError for bad input (3), a failed reconstruction (4), a lack of the machine (5), unknown settings (2).
     """
     from relit.device import use_device
@@ -56,18 +57,19 @@ def reconstruct(
         asset_folder = run.folder / "asset"
         finished = run.done("asset") and (asset_folder / "asset.json").is_file()
         reported = run.done("report") and (run.folder / "report.html").is_file()
-        if finished and reported:
+        if finished and (reported or not report):
             run.say(f"this run is complete: {asset_folder}")
             return asset_folder
         _begin(run, capture, chosen, cost)
         capture = with_cameras(capture, run, job)
         if not finished:
             _save(run, fit(capture, run, options, job.seed), capture, kind, job, chosen)
-        from relit.evaluate.report import write_report
+        if report:
+            from relit.evaluate.report import write_report
 
-        with run.stage("report", title="report"):
-            write_report(run.folder, capture)
-        run.say(f"report: {run.folder / 'report.html'}")
+            with run.stage("report", title="report"):
+                write_report(run.folder, capture)
+            run.say(f"report: {run.folder / 'report.html'}")
         return asset_folder
 
 
