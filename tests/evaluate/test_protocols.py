@@ -8,9 +8,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from relit.capture.synthetic import synthesize_multiview
-from relit.conventions import move_pose, rotate_environment, scale_of, similarity
+from relit.conventions import move_points, move_pose, rotate_environment, scale_of, similarity
 from relit.errors import UserError
-from relit.evaluate import protocols
+from relit.evaluate import metrics, protocols
 from relit.images import write_linear, write_srgb
 from relit.scene import Asset, Mesh
 
@@ -117,11 +117,17 @@ def test_a_larger_object_has_the_known_chamfer_distance_and_hidden_parts_do_not_
     assert same["chamfer"] < 0.01 < protocols.chamfer_figures(itself.mesh, moved, truth, count=20_000)["chamfer"] < 0.1
 
 
-def test_hidden_points_are_not_visible(truth, itself):
-    centres = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
-    extent = np.vstack([centres, [[1, 0, 0], [-1, 0, 0]]])
-    seen = protocols.visible(itself.mesh, itself.world_from_asset, extent, list(truth.train.values()))
-    assert not seen[0] and seen[1]
+def test_what_can_be_seen_from_around_is_the_outer_surface(truth, itself):
+    surface = metrics.sample_surface(itself.mesh.vertices, itself.mesh.faces, 5000)
+    outer = np.linalg.norm(surface.points, axis=1) > 0.5  # of the asset; the hidden ball has radius .3
+    points = move_points(itself.world_from_asset, surface.points)
+    cameras = [*truth.train.values(), *truth.test.values()]
+    seen = protocols.visible(itself.mesh, itself.world_from_asset, points, cameras)
+    assert not seen[~outer].any() and (~outer).any()
+    assert 0.8 < seen[outer].mean() <= 1  # seven cameras above -35 degrees leave some of the underside unseen
+    one = protocols.visible(itself.mesh, itself.world_from_asset, points, cameras[:1])
+    facing = ((cameras[0].centre - points) * points).sum(1) > 0.3  # of a nearly round thing
+    assert one[outer & facing].mean() > 0.97 and 0.25 < one[outer].mean() < 0.55
 
 
 def test_missing_surface_counts_as_an_error(truth, itself):

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from relit.conventions import move_points, rotate_environment, world_from_cv_camera
+from relit.conventions import move_points, rotate_environment, similarity, world_from_cv_camera
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.align import align_cameras, pose_errors, same_frame
-from relit.scene import Asset, Camera, Material, Mesh
+from relit.scene import Asset, Camera, Mesh
 
 SURFACE_SAMPLES = 100_000  # points per mesh for the Chamfer distance
 ROUNDTRIP_VIEWS, ROUNDTRIP_SIDE, ROUNDTRIP_SPP = 3, 400, 64  # pictures, pixels, samples a pixel
@@ -305,20 +305,23 @@ def visible(mesh: Mesh, world_from_asset, points: np.ndarray, cameras: list[Came
     import drjit as dr
     import mitsuba as mi
 
-    from relit.rendering.mitsuba_scene import build_scene
+    from relit.rendering.mitsuba_scene import build_geometry
 
-    grey = Material(np.full((1, 1, 3), 0.5, np.float32), np.ones((1, 1), np.float32), np.zeros((1, 1), np.float32))
-    scene = build_scene(Mesh(mesh.vertices, mesh.faces, mesh.normals), grey, world_from_asset, None).mi_scene
-    gap = 1e-4 * float(np.ptp(points, axis=0).max())
-    p, seen = mi.Point3f(*[mi.Float(np.ascontiguousarray(points[:, k], np.float32)) for k in range(3)]), mi.Bool(False)
+    world = move_points(world_from_asset, mesh.vertices)
+    low, high = world.min(0), world.max(0)
+    unit_from_world = similarity(np.eye(3), -(low + high) / np.ptp(world, axis=0).max(), 2 / np.ptp(world, axis=0).max())
+    vertices = move_points(unit_from_world, world).astype(np.float32)
+    scene = build_geometry(Mesh(vertices, mesh.faces, np.zeros_like(vertices)))  # queries look at no shading normal
+    start, gap = move_points(unit_from_world, points).astype(np.float32), 2e-4
+    p, seen = mi.Point3f(*[mi.Float(np.ascontiguousarray(start[:, k])) for k in range(3)]), dr.zeros(mi.Bool, len(start))
     for camera in cameras:
-        centre = mi.Point3f(*[dr.opaque(mi.Float, float(x)) for x in camera.centre])
-        d = centre - p
+        centre = mi.Point3f(*[dr.opaque(mi.Float, float(x)) for x in move_points(unit_from_world, camera.centre)])
+        d = mi.Vector3f(centre - p)
         length = dr.norm(d)
         d /= length
         seen = seen | ~scene.ray_test(mi.Ray3f(p + gap * d, d, length - gap, 0.0, []))
         dr.eval(seen)
-    return seen.numpy().astype(bool) & np.ones(len(points), bool)
+    return seen.numpy().astype(bool)
 
 
 def chamfer_figures(mesh: Mesh, world_from_asset, truth: Truth, count: int = SURFACE_SAMPLES) -> dict[str, float]:
