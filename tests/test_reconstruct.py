@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -74,6 +77,28 @@ def test_a_stopped_job_resumes_and_a_finished_one_is_left(capsys, tmp_path, capt
     assert before == {p: p.stat().st_mtime_ns for p in before}
     (tmp_path / "run/report.html").unlink()
     assert relit(capsys, *command)[0] == 0 and (tmp_path / "run/report.html").exists() and len(CALLS) == 2
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_inside_a_native_loop_is_still_a_stop(capsys, tmp_path, capture, monkeypatch, number, code):
+    """Dr.Jit's loops raise RuntimeError from whatever passes through them."""
+    import relit.fit.multiview as multiview
+
+    def fit(capture, run, options, seed):
+        with run.stage("volume", steps=3) as stage:
+            stage.save("state", i=1)
+            try:
+                os.kill(os.getpid(), number)
+                time.sleep(1)
+            except BaseException as error:
+                raise RuntimeError("dr.while_loop(): encountered an exception") from error
+
+    monkeypatch.setattr(multiview, "reconstruct", fit)
+    before = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
+    got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
+    assert got == code and "goes on from the checkpoint" in err and "fault of Relit" not in err
+    assert before == [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
+    assert relit(capsys, "inspect", tmp_path / "nowhere")[0] == 3  # the stop is forgotten by the next command
 
 
 def test_the_asset_says_how_it_was_made_and_holds_no_path(capsys, tmp_path, capture):

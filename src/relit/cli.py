@@ -17,7 +17,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from relit import __version__
-from relit.errors import EXIT_OK, EXIT_USAGE, UserError, did_you_mean
+from relit.errors import EXIT_ENVIRONMENT, EXIT_OK, EXIT_USAGE, UserError, did_you_mean
 
 EXIT_BUG, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 130, 143
 
@@ -25,30 +25,37 @@ EXIT_BUG, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 130, 143
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns its exit code and never raises for a user's mistake."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    from relit.run import Terminated, termination
+    from relit.run import stopped_by, termination
 
     guard = termination() if threading.current_thread() is threading.main_thread() else nullcontext()
     try:
         with guard:
             return _dispatch(argv)
-    except UserError as error:
-        return _report(error)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except Terminated:
-        print("terminated", file=sys.stderr)
-        return EXIT_TERMINATED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader left; Python's own flush at exit must not fail
         return EXIT_OK
-    except MemoryError as error:
-        from relit.errors import EXIT_ENVIRONMENT
+    except BaseException as raised:
+        return _answer(stopped_by(raised), argv)
 
+
+def _answer(error: BaseException, argv: list[str]) -> int:
+    """Say what ended the command; returns its exit code."""
+    from relit.run import Terminated
+
+    if isinstance(error, UserError):
+        return _report(error)
+    if isinstance(error, KeyboardInterrupt):
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    if isinstance(error, Terminated):
+        print("terminated", file=sys.stderr)
+        return EXIT_TERMINATED
+    if isinstance(error, MemoryError):
         what = "the machine has run out of memory" + (f": {error}" if str(error) else "")
         return _report(UserError(what, fix="use --quality draft or a smaller --max-side, or close other programs", code=EXIT_ENVIRONMENT))
-    except Exception as error:
+    if isinstance(error, Exception):
         return _unexpected(error, argv)
+    raise error
 
 
 def _dispatch(argv: list[str]) -> int:

@@ -36,6 +36,9 @@ class Terminated(BaseException):
     """SIGTERM, raised in the main thread so that files are closed and the lock is dropped."""
 
 
+STOPS: dict[int, type[BaseException]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+
+
 class Run:
     """One run folder, held by this process. Make it with `Run.open`; it is a context manager."""
 
@@ -104,13 +107,16 @@ class Run:
         try:
             with disk_errors(self.folder):
                 yield stage
-        except BaseException as error:
+        except BaseException as raised:
             watch.stop()
+            error = stopped_by(raised)
             with contextlib.suppress(OSError):
                 self.log.note(f"{stage.title}: stopped by {type(error).__name__} after {readable_seconds(stage.seconds)}")
                 if isinstance(error, (KeyboardInterrupt, Terminated)):
                     self.say(f"stopped in '{stage.title}'; {stage.where_it_resumes()}")
-            raise
+            if error is raised:
+                raise
+            raise error from raised
         peak = watch.stop()
         record = {"name": name, "title": stage.title, "seconds": round(stage.seconds, 3), "peak_memory": peak, "ended": time.time()}
         with disk_errors(self.folder):
@@ -221,18 +227,37 @@ def read_metrics(folder: Path) -> list[dict]:
 # ---------------------------------------------------------------- stopping, holding, comparing
 
 
+_asked_to_stop: list[type[BaseException]] = []  # by a signal, while `termination` is entered
+
+
 @contextlib.contextmanager
 def termination() -> Iterator[None]:
-    """While inside, SIGTERM raises `Terminated` in the main thread."""
+    """While inside, SIGINT raises KeyboardInterrupt and SIGTERM `Terminated` in the main thread, and `stopped_by` remembers it.
 
-    def stop(*_):
-        raise Terminated
+    It must be remembered: native loops (Dr.Jit's) turn whatever passes through them into a RuntimeError.
+    """
 
-    before = signal.signal(signal.SIGTERM, stop)
+    def raising(kind: type[BaseException]):
+        def stop(*_):
+            _asked_to_stop.append(kind)
+            raise kind
+
+        return stop
+
+    before = {number: signal.signal(number, raising(kind)) for number, kind in STOPS.items()}
+    _asked_to_stop.clear()
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def stopped_by(error: BaseException) -> BaseException:
+    """The stop behind `error` where a signal caused it, else `error` itself."""
+    if _asked_to_stop and not isinstance(error, (KeyboardInterrupt, Terminated)):
+        return _asked_to_stop[0]()
+    return error
 
 
 def _refuse_foreign(folder: Path) -> None:
