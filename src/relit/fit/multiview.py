@@ -50,7 +50,7 @@ class MultiviewOptions:
     background: int = 64
     faces: int = 40_000
     texture: int = 512
-    surface_steps: int = 700
+    surface_steps: int = 1500
     points: int = 4096
     directions: int = 64
     light: int = 64
@@ -65,7 +65,7 @@ PRESETS = {
         "background": 48,
         "faces": 12_000,
         "texture": 256,
-        "surface_steps": 200,
+        "surface_steps": 400,
         "points": 2048,
         "light": 32,
     },
@@ -77,7 +77,7 @@ PRESETS = {
         "background": 96,
         "faces": 60_000,
         "texture": 1024,
-        "surface_steps": 2500,
+        "surface_steps": 4000,
     },
 }
 

@@ -28,7 +28,7 @@ class SurfaceOptions:
     """steps, points (pixels per step), directions (per point). texture: texels a side. light: rows of the environment (twice as many columns).
 
     colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step. The other
-    fields weigh terms. warm: part of the steps over which colour_rate rises. smooth_* between similar neighbours (see `similarity`), metallic_binary m (1 - m), metallic_sparse m, light_smooth (total variation of the
+    fields weigh terms. scale_rate: of `exchange_scale` (log). warm: part of the steps over which colour_rate rises. smooth_* between similar neighbours (see `similarity`), metallic_binary m (1 - m), metallic_sparse m, light_smooth (total variation of the
     log radiance), light_neutral (its chroma).
     """
 
@@ -38,19 +38,21 @@ class SurfaceOptions:
     texture: int = 512
     light: int = 64
     colour_rate: float = 0.01
-    roughness_rate: float = 0.02
-    metallic_rate: float = 0.02
+    roughness_rate: float = 0.015
+    metallic_rate: float = 0.01
     light_rate: float = 0.05
+    scale_rate: float = 0.02
     warm: float = 0.3
-    smooth_roughness: float = 0.05
-    smooth_metallic: float = 0.05
-    smooth_colour: float = 0.05
+    roughness_start: float = 0.3
+    smooth_roughness: float = 0.1
+    smooth_metallic: float = 0.1
+    smooth_colour: float = 0.2
     similarity_reach: float = 0.15
     similarity_width: float = 0.1
     metallic_binary: float = 0.01
-    metallic_sparse: float = 0.01
+    metallic_sparse: float = 0.03
     light_smooth: float = 0.002
-    light_neutral: float = 0.002
+    light_neutral: float = 2e-4
 
 
 @dataclass
@@ -69,7 +71,7 @@ def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options:
     """
     mean = float(base[known].mean())
     albedo = np.clip(base * (ALBEDO_START / max(mean, 1e-6)), 0.02, 0.95)
-    material = start_material(options.texture, albedo, 0.5, 0.1)
+    material = start_material(options.texture, albedo, options.roughness_start, 0.1)
     h = options.light
     log_light = mi.Float(np.full(h * 2 * h * 3, np.log(max(radiance, 1e-4) / ALBEDO_START), np.float32))
     return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h))
@@ -88,6 +90,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     environment.rebuild()
     count = options.points
     rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
+    adam_scale = Adam(3)
     adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, model.log_light))
     ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
     ratio = mi.Float(ratio)
@@ -123,6 +126,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         material.colour = adam_colour.step(dr.detach(material.colour), gradients[0], options.colour_rate * decay * warm, ratio)
         material.metallic = adam_metallic.step(dr.detach(material.metallic), gradients[1], options.metallic_rate * decay)
         model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * decay)
+        exchange_scale(material, model, adam_scale, gradients[0], gradients[2], options.scale_rate * decay)
         project(material)
         dr.eval(model.log_light, material.colour, material.metallic)
         environment.radiance = dr.exp(model.log_light)
@@ -137,16 +141,32 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     return model
 
 
-def dual_loss(a, b, target, valid, eps: float = 0.1):
-    """Mean of ((a - L*)(b - L*)) / (sg(L) + eps)^2 over points and channels, a and b independent estimates of L: unbiased for the squared
-    relative error. A pixel whose file value is saturated only says "at least this bright". Outliers lose weight (Geman-McClure)."""
+def exchange_scale(material: MaterialField, model: SurfaceModel, adam: Adam, colour_gradient, light_gradient, rate: float) -> None:
+    """One step along the direction that texel-wise steps find slowest: all of the light brighter and all base colour darker by the same
+    factor (per channel), or the reverse. Only what is not diffuse (F0 of the dielectric) tells where on this line the truth is."""
+    c = dr.arange(mi.UInt32, dr.width(material.colour)) % 4
+    weighted = colour_gradient * dr.detach(material.colour)
+    k = dr.arange(mi.UInt32, dr.width(model.log_light)) % 3
+    slope = [dr.sum(dr.select(k == i, light_gradient, 0)) - dr.sum(dr.select(c == i, weighted, 0)) for i in range(3)]
+    gradient = dr.zeros(mi.Float, 3)
+    for i in range(3):
+        dr.scatter(gradient, slope[i], mi.UInt32(i))
+    move = adam.step(dr.zeros(mi.Float, 3), gradient, rate)
+    dr.eval(move)
+    model.log_light = model.log_light + dr.gather(mi.Float, move, k)
+    factor = dr.select(c < 3, dr.exp(-dr.gather(mi.Float, move, dr.minimum(c, 2))), 1)
+    material.colour = material.colour * factor
+
+
+def dual_loss(a, b, target, valid, eps: float = 0.02):
+    """Mean of (a - L*)(b - L*) / (L* + eps)^1.1 over points and channels; a and b are independent estimates of L, so this is unbiased for
+    the squared error, in units of the display values (the slope of L^(1/2.2)). Nothing but the photo scales or weighs a residual: a weight that depends on the estimates would
+    prefer the dark ones, and the light would come out a fifth too bright. A pixel whose file value is saturated only says "at least
+    this bright"."""
+    scale = dr.rcp(mi.Color3f(target) + eps) ** 1.1
+    value = (a - target) * (b - target) * scale
     mean = dr.detach((a + b) * 0.5)
-    scale = 1 / (mi.Color3f(mean) + eps)
-    ra, rb = (a - target) * scale, (b - target) * scale
-    r = dr.detach((ra + rb) * 0.5)
-    weight = 1 / dr.square(1 + dr.square(r))
-    open_ended = (target >= 0.99) & (mean > target)
-    value = dr.select(open_ended, 0, ra * rb * weight)
+    value = dr.select((target >= 0.99) & (mean > target), 0, value)
     return weighted_mean((value.x + value.y + value.z) / 3, dr.select(valid, mi.Float(1), 0))
 
 

@@ -55,12 +55,12 @@ def first_hits(mesh: TraceableMesh, o, d) -> Points:
         ray = mi.Ray3f(mi.Point3f(o), d)
         pi = mesh.scene.ray_intersect_preliminary(ray, coherent=False)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
-        hit = si.is_valid()
+        hit = si.is_valid() & dr.isfinite(pi.prim_uv.x + pi.prim_uv.y)  # a sliver can give barycentric coordinates that are no numbers
         b = (1 - pi.prim_uv.x - pi.prim_uv.y, pi.prim_uv.x, pi.prim_uv.y)
         corner = [dr.gather(mi.UInt32, mesh.faces, pi.prim_index * 3 + k, hit) for k in range(3)]
         n = sum(b[k] * dr.gather(mi.Vector3f, mesh.normals, corner[k], hit) for k in range(3))
         n = dr.select(hit, dr.normalize(n), mi.Vector3f(0, 0, 1))  # a miss must not become a NaN that meets a zero weight
-        uv = sum(b[k] * dr.gather(mi.Point2f, mesh.uvs, corner[k], hit) for k in range(3))
+        uv = dr.select(hit, sum(b[k] * dr.gather(mi.Point2f, mesh.uvs, corner[k], hit) for k in range(3)), 0)
         x = dr.select(hit, mi.Point3f(mesh.origins.shifted(si, pi.prim_uv, hit)), 0)
         return Points(hit & (dr.dot(si.n, d) < 0), x, n, dr.select(hit, mi.Vector3f(si.n), mi.Vector3f(0, 0, 1)), -mi.Vector3f(d), uv)
 
@@ -114,12 +114,13 @@ def sample_lights(mesh: TraceableMesh, points: Points, surface: Surface, environ
         ray = mi.Ray3f(x, l)
         pi = mesh.scene.ray_intersect_preliminary(ray, coherent=False, active=useful)
         hit = pi.is_valid() & useful
+        known = hit & dr.isfinite(pi.prim_uv.x + pi.prim_uv.y)
         b = (1 - pi.prim_uv.x - pi.prim_uv.y, pi.prim_uv.x, pi.prim_uv.y)
-        corner = [dr.gather(mi.UInt32, mesh.faces, pi.prim_index * 3 + c, hit) for c in range(3)]
+        corner = [dr.gather(mi.UInt32, mesh.faces, pi.prim_index * 3 + c, known) for c in range(3)]
         blocked = mi.Color3f(0)
         for c in range(3):
-            blocked += b[c] * dr.gather(mi.Color3f, mesh.radiance, corner[c], hit)
-        blocked = dr.select(hit, blocked, 0)
+            blocked += b[c] * dr.gather(mi.Color3f, mesh.radiance, corner[c], known)
+        blocked = dr.select(known, blocked, 0)
         out = Lights(count, l, weight, dr.select(hit, mi.Float(0), 1), blocked, point)
         dr.eval(out.l, out.weight, out.visible, out.blocked, out.point)
         return out
