@@ -1,7 +1,7 @@
 """Photos around an object under one fixed, unknown light -> a relightable asset. The recipe of the `multiview` capture.
 
     photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
-    hull       visual hull of the masks, or a ball without masks
+    hull       visual hull of the masks, or without masks the fused depths of a radiance field of the whole scene   fit/explore.py
     volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
     mesh       zero level set, decimated; texture atlas; mean radiance per vertex
     surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/surface.py
@@ -16,12 +16,13 @@ import numpy as np
 
 from relit.conventions import move_points, move_pose, similarity
 from relit.errors import UserError, did_you_mean
+from relit.fit.explore import explore, first_shape
 from relit.fit.pixels import PixelBank, make_bank
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.hull import ball, visual_hull
+from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.materials.field import pictures
@@ -36,7 +37,8 @@ from relit.scene import Asset, Camera, Capture, Material, Mesh
 class MultiviewOptions:
     """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. max_pixels: photos are
     shrunk until all together have no more. refine_cameras: step of the camera corrections in the volume pass (0: cameras are exact).
-    normal: weight of normal priors read from files. background: nodes a side of the background field for photos without masks.
+    normal: weight of normal priors read from files. background, explore_steps: nodes a side of the radiance
+    field for photos without masks, and the steps that fit it.
     faces: of the mesh, about. texture: texels a side. surface_steps, points, directions: steps of the surface pass, pixels per step,
     directions per pixel. light: rows of the environment map.
     """
@@ -47,7 +49,8 @@ class MultiviewOptions:
     max_pixels: int = 24_000_000
     refine_cameras: float = 0.0
     normal: float = 0.05
-    background: int = 64
+    background: int = 96
+    explore_steps: int = 400
     faces: int = 40_000
     texture: int = 512
     surface_steps: int = 1500
@@ -62,7 +65,8 @@ PRESETS = {
         "level_steps": (150, 180),
         "rays": 4096,
         "max_pixels": 8_000_000,
-        "background": 48,
+        "background": 64,
+        "explore_steps": 200,
         "faces": 12_000,
         "texture": 256,
         "surface_steps": 400,
@@ -74,7 +78,8 @@ PRESETS = {
         "levels": (64, 128, 256),
         "level_steps": (400, 600, 800),
         "max_pixels": 60_000_000,
-        "background": 96,
+        "background": 128,
+        "explore_steps": 800,
         "faces": 60_000,
         "texture": 1024,
         "surface_steps": 4000,
@@ -158,7 +163,12 @@ def resize(image, width: int, height: int):
 
 
 def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, options: MultiviewOptions, seed: int) -> VolumeModel:
-    """Hull and volume pass."""
+    """Hull, or without masks a first shape from a radiance field of the whole scene; then the volume pass."""
+    if masks is None:
+        field = start_background(options.background, level)
+        with run.stage("explore", steps=options.explore_steps, title="whole scene (no masks)") as stage:
+            explore(bank, field, options.explore_steps, options.rays // 2, stage, seed)
+            stage.save("field", step=options.explore_steps, cells=np.array(field.cells))
     with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
         n = options.levels[0]
         if masks is not None:
@@ -173,8 +183,16 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
                 ) from None
             model = start_model(values, level, None, full=False)
         else:
-            background = start_background(options.background, level)
-            model = start_model(ball(n, 0.5), level, background, full=True)
+            try:
+                values = first_shape(bank, cameras, field, n)
+            except ValueError:
+                raise UserError(
+                    "nothing solid was found inside the object sphere",
+                    "the cameras are wrong, or the sphere lies beside the object",
+                    "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or masks",
+                    code=4,
+                ) from None
+            model = start_model(values, level, field, full=False)
         fit_volume(bank, model, volume_options(options), stage, seed)
     return model
 

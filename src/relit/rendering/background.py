@@ -43,27 +43,62 @@ def render_background(field: Background, o, d, jitter):
 
     Rays that miss the sphere start at their point closest to the origin. jitter: Float in [0, 1).
     """
-    n, k = field.n, field.samples
+    return _emission(field, *_samples(field, o, d, jitter, 0))[0]
+
+
+def render_everything(field: Background, o, d, jitter, inside: int):
+    """Radiance (Color3f) along whole rays, with `inside` samples within the object sphere before those behind it: the field alone, before
+    there is a surface. Also the mean density within the sphere (Float, per ray). What stands between camera and sphere is not seen."""
+    t, length, ray, k = _samples(field, o, d, jitter, inside)
+    rgb, density, _ = _emission(field, t, length, ray, k)
+    within = mi.Float(dr.tile(dr.arange(mi.UInt32, k), dr.width(d))) < inside
+    return rgb, dr.block_sum(dr.select(within, density * length, 0), k)
+
+
+def median_depth(field: Background, o, d, inside: int):
+    """Distance (Float) at which half the light along each ray is absorbed; detached."""
+    with dr.suspend_grad():
+        t, length, ray, k = _samples(field, o, d, dr.full(mi.Float, 0.5, dr.width(d)), inside)
+        _, _, before = _emission(field, t, length, ray, k)
+        visible = dr.select(dr.exp(-before) > 0.5, t[0], 0)
+        return dr.block_reduce(dr.ReduceOp.Max, visible, k)
+
+
+def _samples(field: Background, o, d, jitter, inside: int):
+    """Sample positions: (distance, position), lengths for the density, ray of each, number per ray. Detached."""
+    k = inside + field.samples
     with dr.suspend_grad():
         o, d = dr.detach(mi.Vector3f(o)), dr.detach(mi.Vector3f(d))
         b = dr.dot(o, d)
         disc = b * b - (dr.squared_norm(o) - 1)
-        start = dr.maximum(-b + dr.sqrt(dr.maximum(disc, 0)), 1e-3)
+        root = dr.sqrt(dr.maximum(disc, 0))
+        near, far = dr.maximum(-b - root, 0), dr.maximum(-b + root, 1e-3)
         rays = dr.width(d)
         ray = dr.repeat(dr.arange(mi.UInt32, rays), k)
-        i = mi.Float(dr.tile(dr.arange(mi.UInt32, k), rays))
+        j = mi.Float(dr.tile(dr.arange(mi.UInt32, k), rays))
         oo, dd = dr.gather(mi.Vector3f, o, ray), dr.gather(mi.Vector3f, d, ray)
-        s0, jit = dr.gather(mi.Float, start, ray), dr.gather(mi.Float, jitter, ray)
-        # t - start = u / (1 - u), u uniform in [0, 1): uniform in inverse distance
-        u0, u1 = i / k, (i + 1) / k
-        um = (i + jit) / k
-        t = s0 + um / dr.maximum(1 - um, 1e-3)
-        length = dr.minimum(u1 / dr.maximum(1 - u1, 1e-3), 1e3) - u0 / (1 - u0)
-        length = length / (1 + um / dr.maximum(1 - um, 1e-3))  # density is per contracted length
-        p = contract(oo + dd * t)
+        t0, t1, jit = dr.gather(mi.Float, near, ray), dr.gather(mi.Float, far, ray), dr.gather(mi.Float, jitter, ray)
+        # behind the sphere t - t1 = u / (1 - u), u uniform in [0, 1): uniform in inverse distance
+        i = dr.maximum(j - inside, 0)
+        u0, u1, um = i / field.samples, (i + 1) / field.samples, (i + jit) / field.samples
+        reach = um / dr.maximum(1 - um, 1e-3)
+        behind = (dr.minimum(u1 / dr.maximum(1 - u1, 1e-3), 1e3) - u0 / (1 - u0)) / (1 + reach)  # density is per contracted length
+        step = dr.maximum(t1 - t0, 0) / max(inside, 1)
+        is_inside = j < inside
+        t = dr.select(is_inside, t0 + (j + jit) * step, t1 + reach)
+        length = dr.select(is_inside, step, behind)
+        length = dr.select(j == k - 1, -1, length)  # what lies farthest is opaque: every ray ends somewhere
+        return (t, oo + dd * t), length, ray, k
+
+
+def _emission(field: Background, at, length, ray, k):
+    """Radiance per ray, density per sample, optical depth before each sample."""
+    n = field.n
+    with dr.suspend_grad():
+        p = contract(at[1])
         q = [dr.clip((c * 0.25 + 0.5) * (n - 1), 0, n - 1.001) for c in (p.x, p.y, p.z)]
         base = [mi.UInt32(c) for c in q]
-        f = [c - mi.Float(j) for c, j in zip(q, base)]
+        f = [c - mi.Float(b) for c, b in zip(q, base)]
         node = (base[2] * n + base[1]) * n + base[0]
     value = mi.Vector4f(0)
     for dz in (0, 1):
@@ -71,9 +106,14 @@ def render_background(field: Background, o, d, jitter):
             for dx in (0, 1):
                 w = (f[0] if dx else 1 - f[0]) * (f[1] if dy else 1 - f[1]) * (f[2] if dz else 1 - f[2])
                 value = dr.fma(dr.gather(mi.Vector4f, field.cells, node + (dz * n + dy) * n + dx), w, value)
-    tau = dr.log(1 + dr.exp(dr.minimum(value.x, 15))) * length
-    tau = dr.select(i == k - 1, 30.0, tau)  # what lies farthest is opaque: every ray ends somewhere
+    density = softplus(value.x)
+    tau = dr.select(length < 0, 30.0, density * length)
     before = dr.block_prefix_sum(tau, k)  # exclusive
     weight = dr.exp(-before) * (1 - dr.exp(-tau))
     rgb = dr.exp(dr.clip(mi.Color3f(value.y, value.z, value.w), -12, 6))
-    return mi.Color3f(*[dr.block_sum(weight * c, k) for c in (rgb.x, rgb.y, rgb.z)])
+    return mi.Color3f(*[dr.block_sum(weight * c, k) for c in (rgb.x, rgb.y, rgb.z)]), density, before
+
+
+def softplus(x):
+    """log(1 + e^x), without overflow."""
+    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
