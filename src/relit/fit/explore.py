@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.loop import Adam, cosine_decay, run_steps
-from relit.fit.losses import composite_loss
+from relit.fit.losses import display_loss
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels, rays_through
 from relit.geometry.fusion import fuse_depths
 from relit.rendering.background import Background, median_depth, render_everything
@@ -40,7 +40,7 @@ def explore(bank: PixelBank, field: Background, steps: int, rays: int, stage, se
         dr.eval(batch.o, batch.d, batch.rgb)
         dr.enable_grad(field.cells)
         rgb, density = render_everything(field, batch.o, batch.d, jitter, INSIDE)
-        loss = composite_loss(rgb, batch.rgb)
+        loss = display_loss(rgb, batch.rgb)
         dr.backward(loss + 1e-4 * dr.mean(density))  # empty unless the photos say otherwise
         gradient = dr.grad(field.cells)
         dr.disable_grad(field.cells)

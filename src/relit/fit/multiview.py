@@ -10,16 +10,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relit.conventions import move_points, move_pose, similarity
+from relit.conventions import move_points, move_pose, similarity, srgb_from_linear
 from relit.errors import UserError, did_you_mean
 from relit.fit.explore import explore, first_shape
-from relit.fit.pixels import PixelBank, make_bank
+from relit.fit.pixels import PixelBank, make_bank, sphere_pixels
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
-from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
+from relit.files import write_text
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import visual_hull
@@ -115,6 +117,7 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
         parts = run_arrays(run, "mesh", "mesh")
     else:
         model = volume_stage(bank, cameras, masks, level, run, options, seed)
+        score_held_out(capture, model, run)
         parts = mesh_stage(model, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
 
@@ -195,6 +198,26 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
             model = start_model(values, level, field, full=False)
         fit_volume(bank, model, volume_options(options), stage, seed)
     return model
+
+
+def score_held_out(capture: Capture, model: VolumeModel, run) -> None:
+    """Say how well the volume pass predicts the photos that the capture sets aside (never used in the fit): kept in stages/volume/held_out.json."""
+    if not capture.held_out or any(p.camera is None for p in capture.held_out):
+        return
+    unit_from_world = np.linalg.inv(capture.sphere.world_from_unit)
+    scores = {}
+    for photo in capture.held_out:
+        pixels = photo.load()
+        camera = photo.camera.with_pose(move_pose(unit_from_world, photo.camera.world_from_camera))
+        covered = sphere_pixels(camera, 1.0)
+        if covered.any():
+            shown = srgb_from_linear(np.clip(render_views(model, [camera])[0], 0, 1))
+            error = (shown - srgb_from_linear(np.clip(pixels.rgb, 0, 1)))[covered]
+            scores[photo.name] = round(float(-10 * np.log10(np.mean(error**2))), 3)
+    mean = float(np.mean(list(scores.values())))
+    definition = "PSNR in dB of the volume pass's picture, sRGB, pixels whose ray meets the object sphere, mean over held-out photos"
+    write_text(run.folder / "stages" / "volume" / "held_out.json", json.dumps({"value": mean, "definition": definition, "per_view": scores}))
+    run.say(f"{len(scores)} photos set aside: {mean:.2f} dB ({definition})")
 
 
 def mesh_stage(model: VolumeModel, run, options: MultiviewOptions) -> dict[str, np.ndarray]:

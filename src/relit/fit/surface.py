@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.loop import Adam, cosine_decay, run_steps
-from relit.fit.losses import weighted_mean
+from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
 from relit.lighting.environment import Environment
 from relit.materials.field import MaterialField, material_at, project, start_material
@@ -158,13 +158,10 @@ def exchange_scale(material: MaterialField, model: SurfaceModel, adam: Adam, col
     material.colour = material.colour * factor
 
 
-def dual_loss(a, b, target, valid, eps: float = 0.02):
-    """Mean of (a - L*)(b - L*) / (L* + eps)^1.1 over points and channels; a and b are independent estimates of L, so this is unbiased for
-    the squared error, in units of the display values (the slope of L^(1/2.2)). Nothing but the photo scales or weighs a residual: a weight that depends on the estimates would
-    prefer the dark ones, and the light would come out a fifth too bright. A pixel whose file value is saturated only says "at least
-    this bright"."""
-    scale = dr.rcp(mi.Color3f(target) + eps) ** 1.1
-    value = (a - target) * (b - target) * scale
+def dual_loss(a, b, target, valid):
+    """Mean of display_weight (a - L*)(b - L*) over points and channels; a and b are independent estimates of L, so this is unbiased for the
+    squared error. A pixel whose file value is saturated only says "at least this bright"."""
+    value = (a - target) * (b - target) * display_weight(target)
     mean = dr.detach((a + b) * 0.5)
     value = dr.select((target >= 0.99) & (mean > target), 0, value)
     return weighted_mean((value.x + value.y + value.z) / 3, dr.select(valid, mi.Float(1), 0))

@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.loop import Adam, cosine_decay, run_steps
-from relit.fit.losses import composite_loss, mask_loss, normal_loss
-from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.losses import display_loss, mask_loss, normal_loss
+from relit.fit.pixels import PixelBank, batch_of, camera_rows, draw_pixels, rays_through
 from relit.geometry.sdf import (
     SdfGrid,
     dense_values,
@@ -30,6 +30,7 @@ from relit.geometry.sdf import (
 from relit.rendering.background import Background, render_background
 from relit.rendering.march import march, sphere_interval
 from relit.rendering.shade import CHANNELS, shade, start_features, start_reflections
+from relit.scene import Camera
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def _fill_unknown(features: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 def fit_volume(bank: PixelBank, model: VolumeModel, options: VolumeOptions, stage, seed: int = 0) -> VolumeModel:
     """Run all levels; returns the same model, optimised. Resumes from the stage's checkpoint when there is one."""
-    total, done = sum(options.steps), 0
+    done = 0
     saved = stage.load("checkpoint")
     start = int(saved["step"]) if saved else 0
     camera_adam = Adam(6 * bank.views)
@@ -115,7 +116,7 @@ def fit_volume(bank: PixelBank, model: VolumeModel, options: VolumeOptions, stag
             break
         _fit_level(bank, model, options, stage, camera_adam, first=max(start, done), begin=done, end=done + steps, seed=seed)
         done += steps
-    assert done <= total
+    stage.save("checkpoint", step=done, **_state(model, bank))  # a stop during the mesh stage need not come back here
     return model
 
 
@@ -159,7 +160,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         colour, normal = shade(m, batch.d, model.reflections)
         if model.background is not None:
             colour = colour + m.transmittance * render_background(model.background, batch.o, batch.d, jitter)
-        loss = composite_loss(colour, batch.rgb, hit if bank.masked else None)
+        # with masks, only whole object pixels: silhouettes are the mask term's, which has no preference for dark or bright
+        loss = display_loss(colour, batch.rgb, hit & (batch.mask > 0.99) if bank.masked else None)
         report = {"colour": loss}
         if bank.masked:
             term = mask_loss(m.opacity, batch.mask)
@@ -187,6 +189,26 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         return report
 
     run_steps(stage, first, end, step, lambda: _state(model, bank))
+
+
+def render_views(model: VolumeModel, cameras: list[Camera], step: float = 0.9) -> list[np.ndarray]:
+    """Linear pictures (H, W, 3) of the fitted field, background included, from `cameras` (unit frame)."""
+    rows, pictures = mi.Float(camera_rows(cameras)), []
+    inv_s, dt = dr.opaque(mi.Float, model.inv_s), dr.opaque(mi.Float, step * model.grid.h)
+    for view, camera in enumerate(cameras):
+        index = dr.arange(mi.UInt32, camera.width * camera.height)
+        x, y = mi.Float(index % camera.width) + 0.5, mi.Float(index // camera.width) + 0.5
+        o, d = rays_through(rows, dr.opaque(mi.UInt32, view, camera.width * camera.height), x, y)
+        t0, t1 = sphere_interval(o, d)
+        dr.eval(o, d, t0, t1)
+        m = march(model.grid, o, d, t0, t1, inv_s, dt)
+        colour, _ = shade(m, d, model.reflections)
+        colour = dr.select(t1 > t0, colour, 0)
+        if model.background is not None:
+            half = dr.full(mi.Float, 0.5, dr.width(index))
+            colour = colour + dr.select(t1 > t0, m.transmittance, 1) * render_background(model.background, o, d, half)
+        pictures.append(np.array(dr.detach(colour)).T.reshape(camera.height, camera.width, 3))
+    return pictures
 
 
 def _state(model: VolumeModel, bank: PixelBank) -> dict[str, np.ndarray]:
