@@ -45,8 +45,8 @@ class MultiviewOptions:
     directions per pixel. light: rows of the environment map.
     """
 
-    levels: tuple[int, ...] = (64, 128, 192)
-    level_steps: tuple[int, ...] = (250, 350, 300)
+    levels: tuple[int, ...] = (64, 128, 256)
+    level_steps: tuple[int, ...] = (250, 350, 400)
     rays: int = 8192
     max_pixels: int = 24_000_000
     refine_cameras: float = 0.0

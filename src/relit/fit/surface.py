@@ -112,13 +112,16 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             dr.eval(start.base, start.roughness, start.metallic)
         lights = sample_lights(mesh, points, start, environment, options.directions, rng)
 
+        # like neighbours share a base colour while the light is being found; then the photos decide every texel
+        colour_smoothing = dr.opaque(mi.Float, options.smooth_colour * decay**2)
+
         params = [material.colour, material.metallic, model.log_light]
         dr.enable_grad(*params)
         environment.radiance = dr.exp(model.log_light)
         surface = material_at(material, points.uv, valid)
         a, b = reflected(points, lights, surface, environment)
         fit = dual_loss(a, b, batch.rgb, valid)
-        prior = material_prior(material, surface, near, valid, options) + light_prior(model.log_light, options)
+        prior = material_prior(material, surface, near, valid, options, colour_smoothing) + light_prior(model.log_light, options)
         dr.backward(fit + prior)
         gradients = [dr.grad(p) for p in params]
         dr.disable_grad(*params)
@@ -177,9 +180,9 @@ def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points
         return first_hits(mesh, points.x + offset + points.n * r, -points.n)
 
 
-def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions):
+def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing):
     """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour and normal should share
-    roughness, metallic and, more strictly, base colour."""
+    roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float)."""
     other = material_at(material, near.uv, near.valid)
     difference = dr.detach(other.base - surface.base)
     alike = dr.exp(-dr.squared_norm(mi.Vector3f(difference)) / (2 * options.similarity_width**2))
@@ -188,7 +191,7 @@ def material_prior(material: MaterialField, surface, near: Points, valid, option
     smooth = (
         options.smooth_roughness * dr.abs(other.roughness - surface.roughness)
         + options.smooth_metallic * dr.abs(other.metallic - surface.metallic)
-        + options.smooth_colour * (change.x + change.y + change.z) * w
+        + colour_smoothing * (change.x + change.y + change.z) * w
     )
     m = surface.metallic
     single = options.metallic_binary * m * (1 - m) + options.metallic_sparse * m

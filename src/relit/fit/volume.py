@@ -175,7 +175,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         gradients = [dr.grad(grid.row_values) + smooth] + [dr.grad(p) for p in params[1:]]
         dr.disable_grad(*params)
         dr.eval(gradients, diffusion, report)
-        kappa = dr.opaque(mi.Float, options.diffusion)
+        kappa = dr.opaque(mi.Float, options.diffusion * decay)
         moved = adam["sdf"].step(dr.detach(grid.row_values), gradients[0], options.sdf_rate * h * decay)
         grid.row_values = moved - kappa * neighbour_mean_difference(grid, diffusion)
         grid.features = adam["features"].step(dr.detach(grid.features), gradients[1], options.feature_rate * decay)
