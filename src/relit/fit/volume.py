@@ -46,13 +46,13 @@ class VolumeOptions:
     levels: tuple[int, ...] = (64, 128, 192)
     steps: tuple[int, ...] = (300, 450, 350)
     rays: int = 8192
-    sdf_rate: float = 0.03
+    sdf_rate: float = 0.06
     feature_rate: float = 0.02
     sharpness: tuple[float, float] = (1.0, 4.0)
     step: float = 0.9
     eikonal: float = 0.1
     diffusion: float = 0.2
-    mask: float = 0.2
+    mask: float = 0.4
     normal: float = 0.05
     band: float = 5.0
     refine_cameras: float = 0.0
