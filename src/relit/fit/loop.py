@@ -12,7 +12,10 @@ import mitsuba as mi
 class Adam:
     """Adam (Kingma & Ba 2015) on one flat Dr.Jit array, with a step that may change without compiling a new kernel."""
 
-    def __init__(self, size: int, beta1: float = 0.9, beta2: float = 0.99):
+    def __init__(self, size: int, beta1: float = 0.9, beta2: float = 0.99, floor: float = 0.0):
+        """floor: adds floor * mean(v) to each entry's second moment, so that entries whose gradient is small noise stay where they are
+        (plain Adam moves them as fast as any other)."""
+        self.floor = floor
         self.m, self.v = dr.zeros(mi.Float, size), dr.zeros(mi.Float, size)
         self.beta1, self.beta2, self.t = beta1, beta2, 0
 
@@ -24,7 +27,11 @@ class Adam:
         correction = dr.opaque(mi.Float, 1 / (1 - b2**self.t))
         self.m = b1 * self.m + (1 - b1) * gradient
         self.v = b2 * self.v + (1 - b2) * dr.square(gradient)
-        out = parameter - size * ratio * self.m / (dr.sqrt(self.v * correction) + 1e-12)
+        second = self.v
+        if self.floor > 0:
+            dr.eval(self.m, self.v)
+            second = self.v + self.floor * dr.mean(self.v)
+        out = parameter - size * ratio * self.m / (dr.sqrt(second * correction) + 1e-12)
         dr.schedule(out, self.m, self.v)
         return out
 

@@ -40,21 +40,23 @@ class VolumeOptions:
     sdf_rate: largest move of a distance per step, in voxels; feature_rate: of a feature. sharpness: inv_s * h at the start and
     the end of a level. step: smallest marching step in voxels. eikonal, mask, normal: weights of the terms. diffusion: per step
     the field moves by -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the value: noise of the grid's own
-    scale dies out, curvature stays. band: half width of the optimised band, voxels. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
+    scale dies out, curvature stays. band: half width of the optimised band, voxels. calm: see
+    Adam's floor: distances with little evidence, such as under a glossy coat, are left to the smoothing. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
     """
 
     levels: tuple[int, ...] = (64, 128, 192)
     steps: tuple[int, ...] = (300, 450, 350)
     rays: int = 8192
-    sdf_rate: float = 0.06
+    sdf_rate: float = 0.2
     feature_rate: float = 0.02
     sharpness: tuple[float, float] = (1.0, 4.0)
     step: float = 0.9
     eikonal: float = 0.1
     diffusion: float = 0.2
-    mask: float = 0.4
+    mask: float = 0.8
     normal: float = 0.05
     band: float = 5.0
+    calm: float = 10.0
     refine_cameras: float = 0.0
 
 
@@ -126,7 +128,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
     rng = mi.PCG32(size=count, initstate=seed * 7919 + begin)
     refine = options.refine_cameras > 0
     adam = {
-        "sdf": Adam(grid.rows),
+        "sdf": Adam(grid.rows, floor=options.calm),
         "features": Adam(grid.rows * grid.channels),
         "reflections": Adam(dr.width(model.reflections)),
     }
@@ -179,7 +181,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         moved = adam["sdf"].step(dr.detach(grid.row_values), gradients[0], options.sdf_rate * h * decay)
         grid.row_values = moved - kappa * neighbour_mean_difference(grid, diffusion)
         grid.features = adam["features"].step(dr.detach(grid.features), gradients[1], options.feature_rate * decay)
-        model.reflections = adam["reflections"].step(dr.detach(model.reflections), gradients[2], 0.02 * decay)
+        model.reflections = adam["reflections"].step(dr.detach(model.reflections), gradients[2], 0.06 * decay)
         if model.background is not None:
             model.background.cells = adam["background"].step(dr.detach(model.background.cells), gradients[3], 0.05 * decay)
         if refine:
