@@ -20,7 +20,7 @@ class Adam:
         self.beta1, self.beta2, self.t = beta1, beta2, 0
 
     def step(self, parameter, gradient, rate: float, ratio=1.0):
-        """The next value of `parameter` (Float, same size). rate: largest move of one entry per step, times `ratio` (1 or Float, same size)."""
+        """The next value of `parameter` (Float, same size). rate: largest move of one entry per step, times `ratio` (1 or Float)."""
         self.t += 1
         b1, b2 = self.beta1, self.beta2
         size = dr.opaque(mi.Float, rate / (1 - b1**self.t))

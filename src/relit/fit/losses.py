@@ -7,7 +7,8 @@ import mitsuba as mi
 
 
 def display_weight(target, eps: float = 0.02):
-    """Weight of a squared difference of radiance that makes it nearly one of display values: (L* + eps)^-1.1, the squared slope of L^(1/2.2).
+    """Weight of a squared difference of radiance that makes it nearly one of display values: (L* + eps)^-1.1, the slope of L^(1/2.2)
+    squared.
 
     From the photo, never from the estimate: a weight that follows the estimate prefers dark ones, which eats a quarter of a
     pixel off every bright silhouette and darkens noisy renderings. target: Color3f, linear.

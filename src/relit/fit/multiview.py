@@ -17,11 +17,11 @@ import numpy as np
 
 from relit.conventions import move_points, move_pose, similarity, srgb_from_linear
 from relit.errors import UserError, did_you_mean
+from relit.files import write_text
 from relit.fit.explore import explore, first_shape
 from relit.fit.pixels import PixelBank, make_bank, sphere_pixels
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
-from relit.files import write_text
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import visual_hull
@@ -134,7 +134,8 @@ def load_pixels(capture: Capture, options: MultiviewOptions, run):
     total = sum(p.width * p.height for p in capture.photos)
     shrink = min(1.0, np.sqrt(options.max_pixels / total))
     if shrink < 1:
-        run.say(f"photos are used at {shrink:.0%} of their size (all together {options.max_pixels / 1e6:.0f} megapixels; --set max_pixels=N)")
+        size = f"all together {options.max_pixels / 1e6:.0f} megapixels; --set max_pixels=N"
+        run.say(f"photos are used at {shrink:.0%} of their size ({size})")
     cameras, images, masks, normals = [], [], [], []
     for photo in capture.photos:
         pixels, camera = photo.load(), photo.camera
@@ -152,7 +153,7 @@ def load_pixels(capture: Capture, options: MultiviewOptions, run):
         masks = [None] * len(masks)
     masked = masks[0] is not None
     weight = sum(float(m.sum()) for m in masks) if masked else sum(i.shape[0] * i.shape[1] for i in images)
-    level = sum((i * (m[..., None] if masked else 1)).sum((0, 1)) for i, m in zip(images, masks)) / max(weight, 1e-6)
+    level = sum((i * (m[..., None] if masked else 1)).sum((0, 1)) for i, m in zip(images, masks, strict=False)) / max(weight, 1e-6)
     prior = normals if any(n is not None for n in normals) else None
     bank = make_bank(cameras, images, masks, prior)
     return bank, cameras, masks if masked else None, np.maximum(level, 1e-3)
@@ -201,7 +202,7 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
 
 
 def score_held_out(capture: Capture, model: VolumeModel, run) -> None:
-    """Say how well the volume pass predicts the photos that the capture sets aside (never used in the fit): kept in stages/volume/held_out.json."""
+    """Say how well the volume pass predicts the photos that the capture sets aside (never used in the fit); stages/volume/held_out.json."""
     if not capture.held_out or any(p.camera is None for p in capture.held_out):
         return
     unit_from_world = np.linalg.inv(capture.sphere.world_from_unit)
@@ -216,7 +217,8 @@ def score_held_out(capture: Capture, model: VolumeModel, run) -> None:
             scores[photo.name] = round(float(-10 * np.log10(np.mean(error**2))), 3)
     mean = float(np.mean(list(scores.values())))
     definition = "PSNR in dB of the volume pass's picture, sRGB, pixels whose ray meets the object sphere, mean over held-out photos"
-    write_text(run.folder / "stages" / "volume" / "held_out.json", json.dumps({"value": mean, "definition": definition, "per_view": scores}))
+    record = {"value": mean, "definition": definition, "per_view": scores}
+    write_text(run.folder / "stages" / "volume" / "held_out.json", json.dumps(record))
     run.say(f"{len(scores)} photos set aside: {mean:.2f} dB ({definition})")
 
 

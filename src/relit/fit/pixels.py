@@ -35,7 +35,7 @@ class PixelBank:
 
 @dataclass
 class RayBatch:
-    """o, d: Vector3f in the unit frame, d unit. rgb: Color3f linear. mask, clipped: Float. view, pixel: UInt32. normal: Vector3f or None."""
+    """o, d: Vector3f in the unit frame, d unit. rgb: Color3f linear. mask: Float. view, pixel: UInt32. normal: Vector3f or None."""
 
     o: Any
     d: Any
@@ -62,7 +62,7 @@ def make_bank(cameras: list[Camera], images: list[np.ndarray], masks: list[np.nd
     sizes = [im.shape[0] * im.shape[1] for im in images]
     offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.uint32)
     candidates, rgbm, extra = [], [], []
-    for k, (camera, image, mask) in enumerate(zip(cameras, images, masks)):
+    for k, (camera, image, mask) in enumerate(zip(cameras, images, masks, strict=False)):
         h, w = image.shape[:2]
         near = sphere_pixels(camera, radius)
         if masked:

@@ -25,11 +25,14 @@ ALBEDO_START = 0.4  # mean base colour at the start; light and albedo share one 
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """steps, points (pixels per step), directions (per point). texture: texels a side. light: rows of the environment (twice as many columns).
+    """steps, points (pixels per step), directions (per point). texture: texels a side. light: rows of the environment (twice as many
+    columns).
 
-    colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step. The other
-    fields weigh terms. scale_rate: of `exchange_scale` (log). warm: part of the steps over which colour_rate rises. smooth_* between similar neighbours (see `similarity`), metallic_binary m (1 - m), metallic_sparse m, light_smooth (total variation of the
-    log radiance), light_neutral (its chroma).
+    colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step; scale_rate: of
+    `exchange_scale` (log). warm: part of the steps over which colour_rate rises from a twentieth. roughness_start: first roughness.
+    smooth_roughness, smooth_metallic, smooth_colour: weights of differences between similar neighbours, up to similarity_reach (unit
+    frame) apart and similarity_width in base colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. light_smooth: total
+    variation of the log radiance. light_neutral: its chroma.
     """
 
     steps: int = 700
@@ -171,7 +174,7 @@ def dual_loss(a, b, target, valid):
 
 
 def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points:
-    """For each point another one on the same stretch of surface, up to `reach` away (log-uniform distance in its tangent plane). Detached."""
+    """For each point another one on the same stretch of surface, up to `reach` away (log-uniform in its tangent plane). Detached."""
     with dr.suspend_grad():
         phi = dr.two_pi * rng.next_float32()
         r = reach * dr.exp(-4 * rng.next_float32())
@@ -181,7 +184,7 @@ def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points
 
 
 def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing):
-    """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour and normal should share
+    """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour should share
     roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float)."""
     other = material_at(material, near.uv, near.valid)
     difference = dr.detach(other.base - surface.base)

@@ -37,11 +37,11 @@ from relit.scene import Camera
 class VolumeOptions:
     """One entry of `levels` and `steps` per level (nodes a side, optimisation steps). rays: rays per step.
 
-    sdf_rate: largest move of a distance per step, in voxels; feature_rate: of a feature. sharpness: inv_s * h at the start and
-    the end of a level. step: smallest marching step in voxels. eikonal, mask, normal: weights of the terms. diffusion: per step
-    the field moves by -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the value: noise of the grid's own
-    scale dies out, curvature stays. band: half width of the optimised band, voxels. calm: see
-    Adam's floor: distances with little evidence, such as under a glossy coat, are left to the smoothing. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
+    sdf_rate: largest move of a distance per step, in voxels; feature_rate: of a feature. sharpness: inv_s * h at the start and the end of a
+    level. step: smallest marching step in voxels. eikonal, mask, normal: weights of the terms. diffusion: per step the field moves by
+    -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the value: noise of the grid's own scale dies out,
+    curvature stays. band: half width of the optimised band, voxels. calm: see Adam's floor: distances with little evidence, such as
+    under a glossy coat, are left to the smoothing. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
     """
 
     levels: tuple[int, ...] = (64, 128, 192)
@@ -106,7 +106,7 @@ def fit_volume(bank: PixelBank, model: VolumeModel, options: VolumeOptions, stag
     saved = stage.load("checkpoint")
     start = int(saved["step"]) if saved else 0
     camera_adam = Adam(6 * bank.views)
-    for number, (n, steps) in enumerate(zip(options.levels, options.steps)):
+    for number, (n, steps) in enumerate(zip(options.levels, options.steps, strict=False)):
         if start >= done + steps and number + 1 < len(options.levels):
             done += steps
             continue

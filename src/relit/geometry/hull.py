@@ -21,7 +21,7 @@ def visual_hull(cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, 
     p = node_positions(n).reshape(-1, 3)
     seen = np.zeros(len(p), np.int32)
     empty = np.zeros(len(p), np.int32)
-    for camera, mask in zip(cameras, masks):
+    for camera, mask in zip(cameras, masks, strict=False):
         m = camera.camera_from_world.astype(np.float32)
         q = p @ m[:3, :3].T + m[:3, 3]
         z = np.maximum(q[:, 2], 1e-6)

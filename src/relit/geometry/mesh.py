@@ -51,7 +51,7 @@ def _without_floaters(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if len(parts) < 2:
         return mesh
     areas = np.array([p.area for p in parts])
-    return trimesh.util.concatenate([p for p, a in zip(parts, areas) if a >= KEEP * areas.max()])
+    return trimesh.util.concatenate([p for p, a in zip(parts, areas, strict=False) if a >= KEEP * areas.max()])
 
 
 def _decimate(mesh: trimesh.Trimesh, ratio: float) -> trimesh.Trimesh:

@@ -153,7 +153,7 @@ def smoothness_gradient(grid: SdfGrid, eikonal):
 
 
 def neighbour_mean_difference(grid: SdfGrid, rows):
-    """L applied to a row array (Float [rows], row 0 is 0): mean of the six neighbours minus the value, 0 at nodes whose neighbours leave the band.
+    """L applied to a row array (Float [rows], row 0 is 0): mean of the six neighbours minus the value; 0 where a neighbour leaves the band.
 
     L L S removes noise of the grid's own scale from S and leaves curvature alone, where L S would shrink thin parts.
     """

@@ -98,7 +98,7 @@ def _emission(field: Background, at, length, ray, k):
         p = contract(at[1])
         q = [dr.clip((c * 0.25 + 0.5) * (n - 1), 0, n - 1.001) for c in (p.x, p.y, p.z)]
         base = [mi.UInt32(c) for c in q]
-        f = [c - mi.Float(b) for c, b in zip(q, base)]
+        f = [c - mi.Float(b) for c, b in zip(q, base, strict=False)]
         node = (base[2] * n + base[1]) * n + base[0]
     value = mi.Vector4f(0)
     for dz in (0, 1):

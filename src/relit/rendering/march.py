@@ -6,7 +6,8 @@ NeuS (Wang et al. 2021, Eq. 13): along a ray, between two samples with signed di
 
 and the operation returns per ray Σ w f (features), Σ w (opacity), Σ w t (depth) and Σ w ∇s (normal, not normalised).
 
-The adjoint replays the march instead of storing samples. With v_i = gF·f_i + gD t_i + gN·∇s_i (f and ∇s at the END of step i, t in its middle) the loss is Σ w_i v_i + gT T_end, so
+The adjoint replays the march instead of storing samples. With v_i = gF·f_i + gD t_i + gN·∇s_i (f and ∇s at the END
+of step i, t in its middle) the loss is Σ w_i v_i + gT T_end, so
 
     ∂L/∂α_i = T_i v_i - (Σ_{j>i} w_j v_j + gT T_end) / (1 - α_i),
 
@@ -43,7 +44,7 @@ def _cell(p, n: int) -> Cell:
     half = 0.5 * (n - 1)
     q = [dr.fma(c, half, half) for c in (p.x, p.y, p.z)]
     i = [dr.clip(mi.Int32(dr.floor(c)), 0, n - 2) for c in q]
-    return Cell(mi.UInt32((i[2] * n + i[1]) * n + i[0]), [c - mi.Float(k) for c, k in zip(q, i)])
+    return Cell(mi.UInt32((i[2] * n + i[1]) * n + i[0]), [c - mi.Float(k) for c, k in zip(q, i, strict=False)])
 
 
 def _corners(cell: Cell, n: int):
@@ -91,7 +92,7 @@ def _fetch_features(features, rows8, weights, packets: int):
     out = []
     for k in range(packets):
         acc = mi.Vector4f(0)
-        for row, w in zip(rows8, weights):
+        for row, w in zip(rows8, weights, strict=False):
             acc = dr.fma(dr.gather(mi.Vector4f, features, row * packets + k), w, acc)
         out += [acc.x, acc.y, acc.z, acc.w]
     return out
@@ -204,7 +205,7 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
             gp = _trilinear_hessian_times(c8, end.f, gN1, n)
             for k in range(packets):
                 gfk = mi.Vector4f(gF[4 * k] * w, gF[4 * k + 1] * w, gF[4 * k + 2] * w, gF[4 * k + 3] * w)
-                for row, weight in zip(rows8, weights):
+                for row, weight in zip(rows8, weights, strict=False):
                     dr.scatter_add(gf, gfk * weight, row * packets + k, shaded, mode=dr.ReduceMode.Direct)
                 gp += _feature_position_gradient(features, rows8, end.f, gfk, packets, k, n)
             go += gp

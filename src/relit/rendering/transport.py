@@ -1,8 +1,8 @@
 """Monte Carlo light transport on a mesh under an environment: what the surface pass differentiates.
 
 SfD Eq. (3): L_o(w_o; x) = ∫ L_i(w_i) f_r(w_i, w_o; x) (w_i·n) dw_i, with many directions at each of few surface points. Half of the
-directions follow the light, half the BRDF (balance heuristic over the mixture). Visibility is traced. Where a direction is blocked, the light
-that arrives is the radiance of the surface that blocks it: the mean radiance that the photos show there, so every inter-reflection
+directions follow the light, half the BRDF (balance heuristic over the mixture). Visibility is traced. Where a direction is blocked, the
+light that arrives is the radiance of the surface that blocks it: the mean radiance that the photos show there, so every inter-reflection
 is in it, and it is a constant of the fit. Directions, visibility and densities are detached (no boundary term: this pass cannot
 move silhouettes or shadow edges).
 """
