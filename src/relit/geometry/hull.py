@@ -11,11 +11,11 @@ from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
 
-def visual_hull(cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, *, tolerance: float = 0.03) -> np.ndarray:
+def visual_hull(cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, *, tolerance: float = 1 / 30) -> np.ndarray:
     """Signed distance (n, n, n) float32 [z, y, x] of the visual hull over [-1, 1]^3.
 
     cameras: in the unit frame. masks: (H, W) in [0, 1], one per camera. A node belongs to the hull when some camera sees it and
-    at most `tolerance` of the cameras that see it (at least one camera in thirty) have background there; so one bad mask
+    at most `tolerance` of the cameras that see it (one in thirty) have background there; so one bad mask
     does not carve the object away.
     """
     p = node_positions(n).reshape(-1, 3)
@@ -30,7 +30,7 @@ def visual_hull(cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, 
         ok = (q[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         seen += ok
         empty[ok] += mask[v[ok], u[ok]] < 0.3
-    inside = (seen > 0) & (empty <= np.floor(seen * tolerance))
+    inside = (seen > 0) & (empty <= np.floor(seen * tolerance + 1e-6))
     inside &= (p**2).sum(1) < 1.0
     return distance_of(inside.reshape(n, n, n))
 

@@ -1,0 +1,160 @@
+"""The recipe on a capture that the test renders: shape, pictures, resume, steady-state kernels."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from relit.capture import open_capture
+from relit.errors import UserError
+from relit.fit.multiview import MultiviewOptions, options_for, reconstruct
+from relit.run import Run
+
+TINY = MultiviewOptions(
+    levels=(24, 40),
+    level_steps=(60, 60),
+    rays=1024,
+    faces=2000,
+    texture=64,
+    surface_steps=60,
+    points=512,
+    directions=16,
+    light=8,
+)
+RADIUS = 0.5  # of the ball that is photographed
+
+
+@pytest.fixture(scope="module")
+def capture_folder(tmp_path_factory):
+    """Fourteen 64x64 photos of a ball with two colours, as NeRF-synthetic files."""
+    import json
+
+    from relit.conventions import world_from_gl_camera
+    from relit.images import write_linear
+    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.scene import Camera, Material, Mesh
+
+    ball = trimesh.creation.uv_sphere(RADIUS, count=[24, 24])
+    v = np.asarray(ball.vertices, np.float32)
+    n = v / np.linalg.norm(v, axis=1, keepdims=True)
+    uvs = np.stack([np.arctan2(n[:, 1], n[:, 0]) / (2 * np.pi) + 0.5, np.arccos(n[:, 2].clip(-1, 1)) / np.pi], -1).astype(np.float32)
+    base = np.full((8, 8, 3), 0.6, np.float32)
+    base[:4] = (0.5, 0.2, 0.1)
+    material = Material(base, np.full((2, 2), 0.5, np.float32), np.zeros((2, 2), np.float32))
+    light = np.full((8, 16, 3), 0.3, np.float32)
+    light[1:3, 3:6] = 4.0
+    scene = build_scene(Mesh(v, np.asarray(ball.faces, np.int32), n, uvs), material, np.eye(4), light)
+    out = tmp_path_factory.mktemp("ball")
+    (out / "train").mkdir()
+    frames, size = [], 64
+    focal = 0.5 * size / np.tan(np.radians(20))
+    for i in range(14):
+        z = 1 - 2 * (i + 0.5) / 14
+        o = 2.0 * np.array([np.sqrt(1 - z * z) * np.cos(2.4 * i), np.sqrt(1 - z * z) * np.sin(2.4 * i), z])
+        f = -o / np.linalg.norm(o)
+        r = np.cross(f, [0, 0, 1.0])
+        r /= np.linalg.norm(r)
+        pose = np.eye(4)
+        pose[:3, :4] = np.stack([r, np.cross(f, r), f, o], 1)
+        picture = render(scene, Camera(size, size, focal, focal, size / 2, size / 2, pose), spp=32, seed=i)
+        write_linear(out / "train" / f"r_{i}.exr", picture)
+        frames.append({"file_path": f"train/r_{i}.exr", "transform_matrix": world_from_gl_camera(pose).tolist()})
+    (out / "transforms_train.json").write_text(json.dumps({"camera_angle_x": float(np.radians(40)), "frames": frames}))
+    return out
+
+
+def test_a_ball_comes_back(capture_folder, tmp_path):
+    from relit.rendering.mitsuba_scene import build_scene, render
+
+    capture = open_capture(capture_folder)
+    with Run.open(tmp_path / "run", {}) as run:
+        asset = reconstruct(capture, run, TINY, 0)
+        again = reconstruct(capture, run, TINY, 0)  # every stage is done: read back, not computed
+    np.testing.assert_array_equal(asset.mesh.vertices, again.mesh.vertices)
+    np.testing.assert_array_equal(asset.material.base_color, again.material.base_color)
+    world = asset.mesh.vertices @ asset.world_from_asset[:3, :3].T + asset.world_from_asset[:3, 3]
+    radius = np.linalg.norm(world, axis=1)
+    assert abs(radius.mean() - RADIUS) < 0.02 and radius.std() < 0.02
+    mesh = trimesh.Trimesh(asset.mesh.vertices, asset.mesh.faces)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    assert mesh.volume > 0  # faces look outward
+    assert (asset.mesh.normals * (world / radius[:, None] @ asset.world_from_asset[:3, :3])).sum(1).mean() > 0.97
+    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
+    photo = capture.photos[3]
+    truth, shown = photo.load(), render(scene, photo.camera, spp=32)
+    error = np.clip(shown[..., :3], 0, 1) ** (1 / 2.2) - np.clip(truth.rgb, 0, 1) ** (1 / 2.2)
+    assert -10 * np.log10(np.mean(error**2)) > 22
+
+
+def test_it_goes_on_from_a_checkpoint(capture_folder, tmp_path, monkeypatch):
+    """A stop in the second level, then the same call: the steps before the checkpoint are not done again, and the result is as good."""
+    import relit.fit.volume as volume
+    from relit.run import Stage
+
+    capture = open_capture(capture_folder)
+    monkeypatch.setattr(Stage, "checkpoint_due", lambda self: True)
+    counted = []
+    original = volume.run_steps
+
+    def stopping(stage, first, last, step, save=None, name="checkpoint"):
+        def counting(i):
+            counted.append(i)
+            if len(counted) == 90:
+                raise KeyboardInterrupt
+            return step(i)
+
+        original(stage, first, last, counting, save, name)
+
+    monkeypatch.setattr(volume, "run_steps", stopping)
+    with Run.open(tmp_path / "run", {}) as run, pytest.raises(KeyboardInterrupt):
+        reconstruct(capture, run, TINY, 0)
+    with Run.open(tmp_path / "run", {}) as run:
+        asset = reconstruct(capture, run, TINY, 0)
+    assert counted[89:92] == [89, 89, 90]  # taken up at the step that was cut off
+    world = asset.mesh.vertices @ asset.world_from_asset[:3, :3].T + asset.world_from_asset[:3, 3]
+    assert abs(np.linalg.norm(world, axis=1).mean() - RADIUS) < 0.02
+
+
+@pytest.mark.parametrize("stage", ["volume", "surface"])
+def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeypatch, stage):
+    """After the first steps every step launches kernels that were seen before, and always the same number of them."""
+    import drjit as dr
+
+    import relit.fit.surface as surface
+    import relit.fit.volume as volume
+
+    seen, late = set(), []
+    module = {"volume": volume, "surface": surface}[stage]
+    original = module.run_steps
+
+    def watching(s, first, last, step, save=None, name="checkpoint"):
+        def watched(i):
+            dr.kernel_history_clear()
+            out = step(i)
+            dr.eval(out)
+            history = dr.kernel_history()
+            hashes = {k["hash"] for k in history if "hash" in k}
+            if i - first >= 8:
+                late.append((len(hashes - seen), sum(k.get("backend_time", 0) for k in history), len(history)))
+            seen.update(hashes)
+            return out
+
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            original(s, first, min(last, first + 20), watched, None, name)
+
+    monkeypatch.setattr(module, "run_steps", watching)
+    with Run.open(tmp_path / "run", {}) as run:
+        reconstruct(open_capture(capture_folder), run, TINY, 0)
+    assert len(late) >= 12
+    assert [new for new, _, _ in late] == [0] * len(late)
+    assert sum(seconds for _, seconds, _ in late) == 0
+    assert len({count for _, _, count in late}) == 1
+
+
+def test_unknown_quality():
+    with pytest.raises(UserError, match="standard"):
+        options_for("standart")
+
+
+def test_levels_and_steps_must_match(capture_folder, tmp_path):
+    with Run.open(tmp_path / "run", {}) as run, pytest.raises(UserError, match="level_steps"):
+        reconstruct(open_capture(capture_folder), run, MultiviewOptions(level_steps=(1,)), 0)
