@@ -182,20 +182,17 @@ def test_gradient_of_each_output(output):
     assert p.difference("values", direction) == pytest.approx(float((g * direction).sum()), rel=0.02)
 
 
-def test_gradient_of_blocks_of_the_grid(problem):
-    """The eight octants one by one, so that errors of opposite sign cannot hide each other. Few rays cross an octant, and a sample that
-    crosses MIN_ALPHA counts for more than in the whole: 10 % each, 3 % for their mean absolute error."""
-    p, gradients = problem
-    g = gradients["values"]
+def test_gradient_of_blocks_of_the_grid(monkeypatch):
+    """The eight octants one by one, so that errors of opposite sign cannot hide each other. Without MIN_ALPHA: the few rays of an octant
+    cross it often enough to move the difference by up to 6 %; without it the two agree to 0.1 %."""
+    monkeypatch.setattr("relit.rendering.march.MIN_ALPHA", 0.0)
+    p = Problem()
+    g = p.gradients()["values"]
     octant = (np.sign(node_positions(N)) @ [1, 2, 4]).ravel()
-    found = []
     for k in np.unique(octant):
         direction = np.zeros_like(g)
         direction[1:] = np.sign(g[1:]) * (octant == k)
-        found.append((p.difference("values", direction), float((g * direction).sum())))
-    difference, analytic = np.array(found).T
-    assert np.abs(difference / analytic - 1).max() < 0.1
-    assert np.abs(difference - analytic).sum() < 0.03 * analytic.sum()
+        assert p.difference("values", direction) == pytest.approx(float((g * direction).sum()), rel=0.005), k
 
 
 def test_outside_the_band_nothing_gets_a_gradient():
