@@ -115,8 +115,8 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             dr.eval(start.base, start.roughness, start.metallic)
         lights = sample_lights(mesh, points, start, environment, options.directions, rng)
 
-        # like neighbours share a base colour while the light is being found; then the photos decide every texel
-        colour_smoothing = dr.opaque(mi.Float, options.smooth_colour * decay**2)
+        # opaque: the weight must not become a literal
+        colour_smoothing = dr.opaque(mi.Float, options.smooth_colour)
 
         params = [material.colour, material.metallic, model.log_light]
         dr.enable_grad(*params)

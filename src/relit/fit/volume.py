@@ -47,7 +47,7 @@ class VolumeOptions:
     levels: tuple[int, ...] = (64, 128, 192)
     steps: tuple[int, ...] = (300, 450, 350)
     rays: int = 8192
-    sdf_rate: float = 0.2
+    sdf_rate: float = 0.06
     feature_rate: float = 0.02
     sharpness: tuple[float, float] = (1.0, 4.0)
     step: float = 0.9
@@ -56,7 +56,7 @@ class VolumeOptions:
     mask: float = 0.8
     normal: float = 0.05
     band: float = 5.0
-    calm: float = 10.0
+    calm: float = 1.0
     refine_cameras: float = 0.0
 
 
@@ -177,7 +177,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         gradients = [dr.grad(grid.row_values) + smooth] + [dr.grad(p) for p in params[1:]]
         dr.disable_grad(*params)
         dr.eval(gradients, diffusion, report)
-        kappa = dr.opaque(mi.Float, options.diffusion * decay)
+        kappa = dr.opaque(mi.Float, options.diffusion * (0.3 + 0.7 * decay))
         moved = adam["sdf"].step(dr.detach(grid.row_values), gradients[0], options.sdf_rate * h * decay)
         grid.row_values = moved - kappa * neighbour_mean_difference(grid, diffusion)
         grid.features = adam["features"].step(dr.detach(grid.features), gradients[1], options.feature_rate * decay)
