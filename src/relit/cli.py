@@ -73,7 +73,7 @@ def _dispatch(argv: list[str]) -> int:
         raise UserError(f"unknown flag '{verb}' before the verb", fix=fix, code=EXIT_USAGE)
     if verb not in VERBS:
         raise UserError(f"unknown verb '{verb}'.{did_you_mean(verb, VERBS)}", f"verbs: {', '.join(VERBS)}", "relit --help", code=EXIT_USAGE)
-    args = parser_for(verb).parse(rest)
+    args = parser_for(verb, rest).parse(rest)
     if args is None:  # --help was answered
         return EXIT_OK
     return VERBS[verb].act(args) or EXIT_OK

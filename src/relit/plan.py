@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -13,8 +15,11 @@ from relit.log import available_memory, readable_bytes
 from relit.scene import Capture, Sphere
 from relit.settings import read_config, with_values
 
-CAPTURES = ("multiview",)  # the kinds that this version reconstructs
-LATER = ("flash", "duplicates", "collection")
+KINDS = ("multiview", "flash", "duplicates", "collection")
+# The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture, run, options, seed) -> Asset.
+# and LIGHT (a phrase) and STAGES (names) for `relit inspect`. It may also hold FINDS_CAMERAS = True (photos without cameras come to it as
+# they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST ({quality: (seconds, bytes)}, see BASE).
+RECIPES = {"multiview": "relit.fit.multiview"}
 QUALITIES = ("draft", "standard", "high")
 JOB_KEYS = {"capture": str, "quality": str, "seed": int, "masks": str, "max_side": int, "focal": float, "sphere": list}
 WRITTEN_KEYS = {"input", "relit", "settings"}  # what config.toml holds besides
@@ -52,13 +57,18 @@ def plan_job(flags: dict, config: str | Path | None) -> tuple[Job, dict]:
 
 
 def capture_kind(asked: str) -> str:
-    """'auto' is multiview until there are other kinds. Raises UserError (code 2) for the kinds of later versions."""
-    if asked in ("auto", *CAPTURES):
-        return "multiview"
-    if asked in LATER:
+    """The kind that was asked for, checked: one of RECIPES, or 'auto'. Raises UserError (code 2) for kinds without a recipe."""
+    if asked == "auto" or asked in RECIPES:
+        return asked
+    if asked in KINDS:
         what = f"--capture {asked} is not available in this version"
-        raise UserError(what, "only multiview captures are reconstructed so far", code=EXIT_USAGE)
-    raise UserError(f"--capture {asked} is not known.{did_you_mean(asked, (*CAPTURES, *LATER))}", code=EXIT_USAGE)
+        raise UserError(what, f"kinds that are reconstructed: {', '.join(RECIPES)}", code=EXIT_USAGE)
+    raise UserError(f"--capture {asked} is not known.{did_you_mean(asked, KINDS)}", code=EXIT_USAGE)
+
+
+def recipe_of(kind: str) -> ModuleType:
+    """The recipe's module. It may be imported before a device is chosen."""
+    return importlib.import_module(RECIPES[kind])
 
 
 def open_input(path: Path, job: Job) -> Capture:
@@ -66,7 +76,15 @@ def open_input(path: Path, job: Job) -> Capture:
     from relit.capture import open_capture
 
     sphere = None if job.sphere is None else Sphere(np.array(job.sphere[:3], dtype=np.float64), float(job.sphere[3]))
-    return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side)
+    least = {} if job.capture not in RECIPES else {"min_photos": getattr(recipe_of(job.capture), "LEAST_PHOTOS", 3)}
+    return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side, **least)
+
+
+def open_as(path: Path, job: Job) -> tuple[Capture, str]:
+    """The capture, and its kind: as asked for, else as the layout of the input tells, else multiview."""
+    asked = capture_kind(job.capture)
+    capture = open_input(path, job)
+    return capture, capture_kind(capture.kind or "multiview") if asked == "auto" else asked
 
 
 BESIDE = ("sparse", "masks", "mask", "segmentations", "silhouettes", "normals", "normal")  # folders whose files decide as well
@@ -101,16 +119,17 @@ SECONDS_PER_PHOTO = {"cameras": 3.0, "load": 0.05}
 BYTES_PER_PIXEL = 40.0  # a decoded photo and its share of the pixel bank
 
 
-def estimate(capture: Capture, job: Job, max_pixels: int | None = None) -> Cost:
-    """Forecast from the number of photos, their pixels and the quality; before the job, so that it can be refused.
+def estimate(capture: Capture, job: Job, kind: str = "multiview", options=None) -> Cost:
+    """Forecast from the number of photos, their pixels, the kind and the quality; before the job, so that it can be refused.
 
-    max_pixels: the recipe shrinks the photos until all together have no more (None: it does not).
+    options: of the recipe, by default those of the quality; photos are shrunk until all together have no more than its `max_pixels`.
     """
+    recipe = recipe_of(kind)
     pixels = sum(p.width * p.height for p in capture.photos)
-    pixels = pixels if max_pixels is None else min(pixels, max_pixels)
-    seconds, memory = BASE[job.quality]
+    pixels = min(pixels, getattr(options or recipe.options_for(job.quality), "max_pixels", pixels))
+    seconds, memory = getattr(recipe, "COST", BASE)[job.quality]
     seconds += len(capture.photos) * SECONDS_PER_PHOTO["load"]
-    if not capture.has_cameras:
+    if not capture.has_cameras and not getattr(recipe, "FINDS_CAMERAS", False):
         seconds += len(capture.photos) * SECONDS_PER_PHOTO["cameras"]
     largest = max((p.width * p.height for p in capture.photos), default=0)
     return Cost(seconds, memory + BYTES_PER_PIXEL * (pixels + 2 * largest), 0.1e9 if job.quality == "draft" else 0.3e9)

@@ -9,18 +9,18 @@ import numpy as np
 from relit.errors import UserError
 from relit.files import write_text
 from relit.log import readable_bytes, readable_seconds
-from relit.plan import Job, estimate, open_input
+from relit.plan import Job, estimate, open_as, recipe_of
 from relit.scene import Capture
 
 
 def inspect(input: str | Path, job: Job, plot: Path | None = None) -> dict:
     """What the input was recognised as, what stands in it, and what a reconstruction would take. plot: an SVG file for the cameras."""
-    capture = open_input(Path(input), job)
+    capture, kind = open_as(Path(input), job)
+    recipe = recipe_of(kind)
     if plot is not None:
         write_plot(plot, capture)
-    from relit.fit.multiview import options_for
-
-    cost = estimate(capture, job, options_for(job.quality).max_pixels)
+    cost = estimate(capture, job, kind)
+    finds_cameras = capture.has_cameras or getattr(recipe, "FINDS_CAMERAS", False)
     sizes = sorted({(p.width, p.height) for p in capture.photos})
     ball = capture.sphere and {"centre": [float(x) for x in capture.sphere.centre], "radius": float(capture.sphere.radius)}
     return {
@@ -32,9 +32,10 @@ def inspect(input: str | Path, job: Job, plot: Path | None = None) -> dict:
         "cameras": "given" if capture.has_cameras else "none; they would be found from the photos",
         "sphere": ball,
         "masks": mask_coverage(capture),
-        "light": "one fixed light is assumed (multiview)",
+        "capture": kind,
+        "light": recipe.LIGHT,
         "notes": list(capture.notes),
-        "stages": ([] if capture.has_cameras else ["cameras"]) + ["volume", "mesh", "surface", "asset", "report"],
+        "stages": ([] if finds_cameras else ["cameras"]) + [*recipe.STAGES, "asset", "report"],
         "estimate": {"seconds": round(cost.seconds), "memory": round(cost.memory), "disk": round(cost.disk), "quality": job.quality},
     }
 

@@ -13,7 +13,7 @@ from relit import __version__
 from relit.errors import UserError
 from relit.files import write_text
 from relit.log import readable_bytes, readable_seconds
-from relit.plan import Cost, Job, capture_kind, check_memory, estimate, input_digests, open_input, plan_job
+from relit.plan import Cost, Job, capture_kind, check_memory, estimate, input_digests, open_as, plan_job, recipe_of
 from relit.run import Run
 from relit.scene import Capture
 from relit.settings import with_pairs, with_values
@@ -34,23 +34,21 @@ def reconstruct(
     """Photos -> `out`/asset; returns the asset folder. Giving the same call again resumes or finds it done.
 
     flags: the fields of `Job`; None means not given. config: a TOML file whose values stand where no flag was given. pairs: 'key=value'
-    texts, settings: {key: value}, both for the fields of `relit.fit.multiview.MultiviewOptions`. report: write report.html as well.
+    texts, settings: {key: value}, both for the fields of the recipe's options (for example
+    `relit.fit.multiview.MultiviewOptions`). report: write report.html as well.
     Raises UserError for bad input (3), a failed reconstruction (4), a lack of the machine (5), unknown settings (2).
     """
     from relit.device import use_device
 
     job, from_file = plan_job(flags, config)
-    kind = capture_kind(job.capture)
+    capture_kind(job.capture)  # a kind that is not there is refused before anything is read
     apart(Path(input), Path(out))
     chosen = use_device(device)
-
-    from relit.fit.multiview import options_for
-    from relit.fit.multiview import reconstruct as fit
-
-    options = with_values(options_for(job.quality), from_file, f"--config {config}")
+    capture, kind = open_as(Path(input), job)
+    recipe = recipe_of(kind)
+    options = with_values(recipe.options_for(job.quality), from_file, f"--config {config}")
     options = with_values(with_pairs(options, pairs), settings or {}, "settings")
-    capture = open_input(Path(input), job)
-    cost = estimate(capture, job, options.max_pixels)
+    cost = estimate(capture, job, kind, options)
     check_memory(cost, chosen)
     record = {"input": Path(input).resolve().name, **dataclasses.asdict(job), "capture": kind, "settings": dataclasses.asdict(options)}
     with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
@@ -61,9 +59,10 @@ def reconstruct(
             run.say(f"this run is complete: {asset_folder}")
             return asset_folder
         _begin(run, capture, chosen, cost)
-        capture = with_cameras(capture, run, job)
+        if not getattr(recipe, "FINDS_CAMERAS", False):
+            capture = with_cameras(capture, run, job)
         if not finished:
-            _save(run, fit(capture, run, options, job.seed), capture, kind, job, chosen)
+            _save(run, recipe.reconstruct(capture, run, options, job.seed), capture, kind, job, chosen)
         if report:
             from relit.evaluate.report import write_report
 

@@ -116,6 +116,7 @@ class Capture:
     points: (N, 3) sparse points in world units, or None. up: (3,) unit up direction in world, or None when unknown.
     black_background: True where pixels outside the masks are known to be black (alpha composites, dark rooms).
     notes: what the reader did that the user did not ask for, one sentence each.
+    kind: the kind of capture where the layout of the files tells it ('flash', 'duplicates', 'collection'), else ''.
     """
 
     root: Path
@@ -127,6 +128,7 @@ class Capture:
     up: np.ndarray | None = None
     black_background: bool = False
     notes: tuple[str, ...] = field(default_factory=tuple)
+    kind: str = ""
 
     @property
     def has_cameras(self) -> bool:

@@ -38,7 +38,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class Reading:
-    """The frames of one capture, with what else the format tells. points: (N, 3) world. sphere: given by the format, or None."""
+    """The frames of one capture, with what else the format tells. points: (N, 3) world. sphere: given by the format, or None.
+    kind: of capture, where the format tells it (see `scene.Capture`)."""
 
     format: str
     root: Path
@@ -46,6 +47,7 @@ class Reading:
     points: np.ndarray | None = None
     sphere: Sphere | None = None
     notes: tuple[str, ...] = ()
+    kind: str = ""
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -89,6 +89,7 @@ def open_capture(
         up=up,
         black_background=dark,
         notes=tuple(notes),
+        kind=reading.kind,
     )
     if masks == "grabcut" and not capture.has_cameras:
         return replace(capture, notes=(*capture.notes, "GrabCut is seeded by the object sphere: it waits until the cameras are found"))

@@ -34,6 +34,9 @@ from relit.rendering.shade import mean_radiance
 from relit.rendering.transport import TraceableMesh
 from relit.scene import Asset, Camera, Capture, Material, Mesh
 
+LIGHT = "one fixed light is assumed (multiview)"  # what `relit inspect` says
+STAGES = ("volume", "mesh", "surface")
+
 
 @dataclass(frozen=True)
 class MultiviewOptions:

@@ -1,0 +1,59 @@
+"""Means, verdicts and tables of a suite's results."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from relit.benchmark.suites import Bar, Suite
+
+
+def means(runs: dict[str, dict]) -> dict[str, float]:
+    """Mean over objects of every figure that all of them have."""
+    first, *rest = [r["metrics"] for r in runs.values()]
+    names = [k for k in first if all(k in r for r in rest)]
+    return {k: float(np.mean([first[k]["value"], *(r[k]["value"] for r in rest)])) for k in names}
+
+
+def verdict(bar: Bar | None, value: float) -> str:
+    """'' without a bar, 'met', or by how much a mean misses its bar."""
+    if bar is None:
+        return ""
+    missed = bar[1] - value if bar[0] == ">=" else value - bar[1]
+    return "met" if missed <= 0 else f"missed by {missed:.3g}"
+
+
+def bar_text(bar: Bar | None) -> str:
+    return f"{bar[0]} {bar[1]:g}" if bar else ""
+
+
+def markdown(result: dict[str, Any], suite: Suite) -> str:
+    """A fragment for benchmarks/RESULTS.md: per variant one table with the objects, the mean, and the bar."""
+    lines = [f"Suite `{result['suite']}`, quality `{result['quality']}`, device `{result['device']}`, {result['machine']}.", ""]
+    for variant, runs in result["runs"].items():
+        lines += [f"### {variant}", "", f"| figure | unit | {' | '.join(runs)} | mean | bar | |", "|---" * (len(runs) + 5) + "|"]
+        for figure, mean in result["means"][variant].items():
+            values = " | ".join(f"{r['metrics'][figure]['value']:.4g}" for r in runs.values())
+            bar, unit = suite.bar(figure, result["quality"]), next(iter(runs.values()))["metrics"][figure]["unit"]
+            lines.append(f"| {figure} | {unit} | {values} | {mean:.4g} | {bar_text(bar)} | {verdict(bar, mean)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def table(result: dict[str, Any], suite: Suite):
+    """A rich Table of the means: one column a variant, one row a figure."""
+    from rich.table import Table
+
+    out = Table(title=f"{result['suite']}, {result['quality']}, mean of {len(next(iter(result['runs'].values())))} objects")
+    out.add_column("figure")
+    for variant in result["means"]:
+        out.add_column(variant, justify="right")
+    out.add_column("bar", justify="right")
+    out.add_column("")
+    first = next(iter(result["means"].values()))
+    for figure, value in first.items():
+        bar = suite.bar(figure, result["quality"])
+        row = [f"{v[figure]:.4g}" if figure in v else "" for v in result["means"].values()]
+        out.add_row(figure, *row, bar_text(bar), verdict(bar, value))
+    return out

@@ -1,0 +1,85 @@
+"""The suites: what is rendered, how it is reconstructed and scored, the bars of its means, its named ablations.
+
+A suite of another capture kind is one entry of SUITES, most readably from a module of its own that only holds it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+Bar = tuple[str, float]  # ('>=' or '<=', value)
+
+
+@dataclass(frozen=True)
+class Item:
+    """One object of a suite. asset: file relative to the data folder. light: one such file, or several (photos under many lights, ...).
+    options: what goes to the synthesizer for this object alone, before the suite's own options."""
+
+    name: str
+    asset: str
+    light: str | tuple[str, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Suite:
+    """kind: as `relit reconstruct --capture` knows it. relights: lights, relative to the data folder, for the truth of relighting.
+
+    options: keyword arguments of the synthesizer, for all objects.
+    synthesize: 'module.function', called as f(asset, light, out, relights=[...], **options, say=...) -> capture folder; several lights
+    come as a list. Beside it in its module stands settings_of(asset, light, relights=[...], **options): everything that the capture
+    depends on, whose hash names the folder in the cache.
+    evaluate: 'module.function', called as f(run, capture, spp=...) -> {"metrics": {name: {"value", "unit", "definition"}}, ...}.
+    bars: of the means at quality standard, figure -> bar; draft_bars: at draft.
+    flags: words added to every `relit reconstruct` of the suite.
+    ablations: name -> words for `relit reconstruct`: each is 'key=value' (a --set) or a flag such as '--masks=none'.
+    """
+
+    kind: str
+    items: tuple[Item, ...]
+    relights: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    synthesize: str = "relit.capture.synthetic.synthesize_multiview"
+    evaluate: str = "relit.evaluate.protocols.evaluate"
+    bars: Mapping[str, Bar] = field(default_factory=dict)
+    draft_bars: Mapping[str, Bar] = field(default_factory=dict)
+    flags: tuple[str, ...] = ()
+    ablations: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def bar(self, figure: str, quality: str) -> Bar | None:
+        """The bar of a figure at a quality, or None."""
+        return {"standard": self.bars, "draft": self.draft_bars}.get(quality, {}).get(figure)
+
+
+def named(path: str) -> Callable:
+    """The function 'module.function'."""
+    module, _, function = path.rpartition(".")
+    return getattr(importlib.import_module(module), function)
+
+
+MULTIVIEW = Suite(
+    kind="multiview",
+    items=(
+        Item("spot", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"roughness": 0.4, "metallic": 0.0}),
+        Item("boombox", "assets/BoomBox.glb", "envmaps/kiara_1_dawn_1k.hdr"),
+        Item("stool", "assets/painted_wooden_stool_1k.glb", "envmaps/immenstadter_horn_1k.hdr"),  # a sun of 7040
+    ),
+    relights=("envmaps/adams_place_bridge_1k.hdr", "envmaps/forest_slope_1k.hdr"),
+    options={"views": 60, "test_views": 12, "resolution": 400, "spp": 64, "test_spp": 256, "seed": 0},
+    bars={
+        "seconds": ("<=", 360.0),
+        "peak_memory": ("<=", 4.0),
+        "novel_psnr": (">=", 32.0),
+        "relit_psnr": (">=", 31.0),
+        "albedo_psnr": (">=", 26.0),
+        "normal_mae": ("<=", 8.0),
+        "chamfer_percent": ("<=", 0.5),
+        "glb_roundtrip_psnr": (">=", 35.0),
+    },
+    draft_bars={"seconds": ("<=", 90.0), "peak_memory": ("<=", 4.0)},
+)
+
+SUITES: dict[str, Suite] = {"multiview": MULTIVIEW}

@@ -1,0 +1,44 @@
+"""The verbs of the command line: one entry each, with its flags and the function that it calls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from relit.verbs.after import do_export, do_relight, export_flags, relight_flags
+from relit.verbs.jobs import (
+    demo_flags,
+    do_demo,
+    do_doctor,
+    do_inspect,
+    do_reconstruct,
+    doctor_flags,
+    inspect_flags,
+    reconstruct_flags,
+)
+from relit.verbs.measure import benchmark_flags, do_benchmark, do_evaluate, evaluate_flags
+from relit.verbs.parser import Parser, Verb
+from relit.verbs.synthesizers import SYNTHESIZERS, do_synthesize, synthesize_flags
+
+VERBS: dict[str, Verb] = {
+    "doctor": Verb("what this machine has, what is missing, and the command that mends it", doctor_flags, do_doctor),
+    "demo": Verb("renders its own object, reconstructs it, scores it, writes the report", demo_flags, do_demo),
+    "inspect": Verb("what an input is recognised as, and what a reconstruction would take", inspect_flags, do_inspect),
+    "reconstruct": Verb("photos into a relightable asset; giving the same command again resumes", reconstruct_flags, do_reconstruct),
+    "export": Verb("the asset as glb, obj, ply or a Mitsuba scene", export_flags, do_export),
+    "relight": Verb("pictures of the asset under another light", relight_flags, do_relight),
+    "evaluate": Verb("every figure that a known truth allows, with its definition", evaluate_flags, do_evaluate),
+    "synthesize": Verb("renders a capture with known truth", synthesize_flags, do_synthesize, SYNTHESIZERS),
+    "benchmark": Verb("synthesize, reconstruct and evaluate over a suite", benchmark_flags, do_benchmark),
+}
+
+__all__ = ["VERBS", "Parser", "Verb", "parser_for"]
+
+
+def parser_for(verb: str, argv: Sequence[str] = ()) -> Parser:
+    """The parser of one verb. argv: the words after the verb; a verb with kinds takes the flags of the kind that they name."""
+    spec = VERBS[verb]
+    parser = Parser(verb, spec.summary)
+    spec.flags(parser)
+    if spec.kinds:
+        spec.kinds[spec.kind_in(argv)].flags(parser)
+    return parser

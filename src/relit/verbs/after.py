@@ -1,0 +1,61 @@
+"""export, relight: what is done with an asset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from relit.errors import EXIT_USAGE, UserError
+from relit.verbs.parser import DEVICES, Parser, free, out_flag, path_in
+
+
+def export_flags(parser: Parser) -> None:
+    path_in(parser, "run", "run folder or asset folder")
+    out_flag(parser, "file (or folder, for mitsuba) to write")
+    parser.common.add_argument("--format", choices=("glb", "obj", "ply", "mitsuba"), default=None, help="default: by the ending of -o")
+    parser.more.add_argument("--overwrite", action="store_true", help="replace an existing file")
+
+
+def do_export(args) -> None:
+    kind = args.format or {".glb": "glb", ".obj": "obj", ".ply": "ply"}.get(args.out.suffix.lower())
+    if kind is None:
+        raise UserError("the form cannot be told from the ending of -o", fix="add --format glb, obj, ply or mitsuba", code=EXIT_USAGE)
+    free(args.out, args.overwrite)
+    from relit.asset.export import export_asset
+
+    export_asset(args.run, kind, args.out)
+    print(args.out)
+
+
+def relight_flags(parser: Parser) -> None:
+    path_in(parser, "run", "run folder or asset folder")
+    parser.common.add_argument("--light", required=True, type=Path, metavar="FILE", help="lat-long .hdr or .exr")
+    out_flag(parser, "folder of pictures, or FILE.mp4")
+    add = parser.common.add_argument
+    add("--cameras", default="capture", metavar="WHICH", help="capture (default), orbit:N for a turntable, or a transforms.json")
+    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    more = parser.more.add_argument
+    more("--spp", type=int, default=64, help="samples a pixel (default 64)")
+    more("--size", type=int, default=None, metavar="PIXELS", help="longer side of the pictures")
+    more("--rotate", type=float, default=0.0, metavar="DEGREES", help="turn the light about the object's up")
+    more("--exr", action="store_true", help="linear EXR pictures besides the PNG ones")
+    more("--overwrite", action="store_true", help="replace existing pictures")
+
+
+def do_relight(args) -> None:
+    free(args.out, args.overwrite)
+    from relit.device import use_device
+    from relit.log import Log, Progress
+
+    use_device(args.device)
+    from relit.relight import relight
+
+    progress = Progress(Log(), "relight", None)
+
+    def show(done: int, count: int) -> None:
+        progress.steps = count
+        progress.update(done)
+
+    options = {"cameras": args.cameras, "spp": args.spp, "size": args.size, "exr": args.exr, "rotate": args.rotate}
+    relight(args.run, args.light, args.out, progress=show, **options)
+    progress.log.clear()
+    print(args.out)

@@ -1,0 +1,90 @@
+"""doctor, demo, inspect, reconstruct: flags, and the function that each calls. Heavy imports stand inside the functions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from relit.verbs.parser import DEVICES, KINDS, QUALITIES, Parser, free, job_flags, opening_flags, out_flag, path_in
+
+# ---------------------------------------------------------------- doctor, demo, inspect
+
+
+def doctor_flags(parser: Parser) -> None:
+    parser.common.add_argument("--json", action="store_true", help="print JSON")
+
+
+def do_doctor(args) -> int:
+    from relit import doctor
+
+    checks = doctor.examine()
+    print(doctor.as_json(checks) if args.json else doctor.as_text(checks))
+    return doctor.verdict(checks)
+
+
+def demo_flags(parser: Parser) -> None:
+    out_flag(parser, "folder for the capture and the run (default runs/demo)", Path("runs/demo"))
+    parser.common.add_argument("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    parser.common.add_argument("--overwrite", action="store_true", help="begin anew where an earlier demo is complete or was stopped")
+
+
+def do_demo(args) -> None:
+    from relit.demo import demo
+
+    demo(args.out, device=args.device, overwrite=args.overwrite)
+
+
+def inspect_flags(parser: Parser) -> None:
+    path_in(parser, "input", "folder of photos, transforms.json, COLMAP model, ...")
+    parser.common.add_argument("--json", action="store_true", help="print JSON")
+    parser.common.add_argument("--quality", choices=QUALITIES, default="standard", help="for the estimate of time and memory")
+    parser.common.add_argument("--plot", type=Path, default=None, metavar="FILE.svg", help="draw the cameras around the object sphere")
+    opening_flags(parser)
+
+
+def do_inspect(args) -> None:
+    from relit.plan import Job
+    from relit.preflight import as_text, inspect
+
+    if args.plot is not None:
+        free(args.plot, overwrite=False)
+    job = Job(quality=args.quality, masks=args.masks or "auto", sphere=args.sphere, max_side=args.max_side)
+    found = inspect(args.input, job, args.plot)
+    print(json.dumps(found, indent=2) if args.json else as_text(found))
+
+
+# ---------------------------------------------------------------- reconstruct
+
+
+def reconstruct_flags(parser: Parser) -> None:
+    path_in(parser, "input", "folder of photos, transforms.json, COLMAP model, ... (docs/formats.md)")
+    out_flag(parser, "run folder; giving the same command again resumes")
+    add = parser.common.add_argument
+    add("--capture", choices=("auto", *KINDS), default=None, help="what kind of photos (default auto)")
+    job_flags(parser, None)
+    add("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs", help="one setting of the recipe; may be repeated")
+    add("--config", type=Path, default=None, metavar="FILE.toml", help="settings from a file, a run's config.toml too; flags win")
+    opening_flags(parser)
+    parser.more.add_argument("--focal", type=float, default=None, metavar="PIXELS", help="known focal length, for photos without cameras")
+    parser.more.add_argument("--overwrite", action="store_true", help="remove what an earlier run left in the folder and begin anew")
+
+
+def do_reconstruct(args) -> None:
+    from relit.reconstruct import reconstruct
+
+    asset = reconstruct(
+        args.input,
+        args.out,
+        capture=args.capture,
+        quality=args.quality,
+        device=args.device,
+        seed=args.seed,
+        pairs=args.pairs,
+        config=args.config,
+        masks=args.masks,
+        sphere=args.sphere,
+        max_side=args.max_side,
+        focal=args.focal,
+        overwrite=args.overwrite,
+    )
+    print(asset / "object.glb")
