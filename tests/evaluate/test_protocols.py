@@ -100,7 +100,7 @@ def test_a_recovered_frame_is_aligned_by_its_cameras(truth, itself):
     cameras = tuple((name, c.with_pose(move_pose(free, c.world_from_camera))) for name, c in itself.cameras)
     environment = rotate_environment(itself.environment, free)  # a turn by whole texels: nothing is lost
     asset = replace(itself, world_from_asset=free @ itself.world_from_asset, cameras=cameras, environment=environment)
-    back, how = protocols.aligned(asset, truth, {protocols.camera_key(n): c for n, c in cameras})
+    back, how = protocols.aligned(asset, truth.train, {protocols.camera_key(n): c for n, c in cameras})
     assert how == "sim3"
     np.testing.assert_allclose(back.world_from_asset, itself.world_from_asset, atol=1e-9)
     np.testing.assert_allclose(back.environment, itself.environment, atol=1e-3)

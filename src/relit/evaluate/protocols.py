@@ -16,60 +16,8 @@ from relit.conventions import move_points, rotate_environment, similarity, world
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.align import align_cameras, pose_errors, same_frame
+from relit.evaluate.definitions import DEFINITIONS, ROUNDTRIP_SIDE, ROUNDTRIP_SPP, ROUNDTRIP_VIEWS, SURFACE_SAMPLES
 from relit.scene import Asset, Camera, Mesh
-
-SURFACE_SAMPLES = 100_000  # points per mesh for the Chamfer distance
-ROUNDTRIP_VIEWS, ROUNDTRIP_SIDE, ROUNDTRIP_SPP = 3, 400, 64  # pictures, pixels, samples a pixel
-
-SCALE = "one factor per channel on the linear base colour, sum(truth) / sum(predicted) over the object's pixels of a few TRAINING views"
-DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
-    "novel_psnr": ("dB", f"test views under the recovered light: {m.DEFINITIONS['psnr']}"),
-    "novel_psnr_masked": ("dB", f"test views under the recovered light: {m.DEFINITIONS['psnr_masked']}"),
-    "novel_ssim": ("", f"test views under the recovered light: {m.DEFINITIONS['ssim']}"),
-    "novel_ssim_masked": ("", f"test views under the recovered light: {m.DEFINITIONS['ssim_masked']}"),
-    "relit_psnr": ("dB", f"test views under the unseen lights, mean over lights, base colour scaled ({SCALE}): {m.DEFINITIONS['psnr']}"),
-    "relit_psnr_masked": ("dB", f"as relit_psnr: {m.DEFINITIONS['psnr_masked']}"),
-    "relit_ssim": ("", f"as relit_psnr: {m.DEFINITIONS['ssim']}"),
-    "relit_psnr_unscaled": ("dB", "as relit_psnr, without any scale, rendered with a quarter of the samples"),
-    "relit_psnr_masked_unscaled": ("dB", "as relit_psnr_masked, without any scale, rendered with a quarter of the samples"),
-    "albedo_psnr": (
-        "dB",
-        f"base colour in test views, scaled ({SCALE}), clipped to [0, 1] and sRGB-encoded, over pixels with truth coverage >= {m.MASK}; "
-        "a pixel without a prediction counts as black; mean of the per-view PSNR",
-    ),
-    "albedo_psnr_linear": ("dB", "as albedo_psnr, on linear values"),
-    "albedo_psnr_unscaled": ("dB", "as albedo_psnr, without any scale"),
-    "normal_mae": ("degrees", f"{m.DEFINITIONS['mae']}; mean over test views"),
-    "roughness_mse": ("", f"perceptual roughness (alpha = r^2) in test views: {m.DEFINITIONS['mse']}"),
-    "metallic_mse": ("", f"metallic in test views: {m.DEFINITIONS['mse']}"),
-    "mask_iou": ("", "intersection over union of predicted and true coverage >= .5, mean over test views"),
-    "chamfer": (
-        "world units",
-        f"mean of the two mean distances from samples of one surface to the triangles of the other, {SURFACE_SAMPLES} a mesh, uniform "
-        "by area, of which those count that at least one camera (training or test) sees past the mesh itself: hidden inner surfaces do not "
-        "count on either side; not squared",
-    ),
-    "chamfer_percent": ("% of diameter", "chamfer in per cent of the diameter of the true object's bounding sphere"),
-    "chamfer_accuracy": ("world units", "the half of chamfer from the reconstruction to the truth"),
-    "chamfer_completeness": ("world units", "the half of chamfer from the truth to the reconstruction"),
-    "environment_mse": (
-        "",
-        "recovered against true light, lat-long 256x512, clipped to [0, 1], to the power 1/2.2, mean of all texels (SfD)",
-    ),
-    "environment_mse_scaled": ("", "as environment_mse, the recovered light divided by the albedo scale first"),
-    "environment_log_rmse": (
-        "stops",
-        "root mean square difference of log2 radiance by solid angle at 32x64, below 1 % of the mean raised to it, light divided by the "
-        "albedo scale first",
-    ),
-    "glb_roundtrip_psnr": (
-        "dB",
-        f"asset read back from object.glb against pictures that the fit rendered of what it held in memory, {ROUNDTRIP_VIEWS} training "
-        f"views, recovered light, same random numbers: {m.DEFINITIONS['psnr']}",
-    ),
-    "camera_rotation": ("degrees", "median rotation error of the recovered cameras after Sim(3) alignment to the true ones"),
-    "camera_centre_percent": ("% of diameter", "median distance of the recovered camera centres after Sim(3), of the object's diameter"),
-}
 
 
 @dataclass(frozen=True)
@@ -88,6 +36,12 @@ class Truth:
         from relit.images import read_data
 
         return read_data(self.folder / "truth" / f"{relative}.exr")
+
+
+def has_truth(folder: str | Path) -> bool:
+    """Whether `relit synthesize` made the folder, finished or not."""
+    folder = Path(folder)
+    return folder.name == "truth" or (folder / "truth" / "settings.json").is_file() or (folder / "truth" / "truth.json").is_file()
 
 
 def load_truth(folder: str | Path) -> Truth:
@@ -125,7 +79,8 @@ def camera_key(name: str) -> str:
 
 
 def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
-    """Every figure that the truth allows, for the asset in a run or asset folder.
+    """Every figure that the truth allows, for the asset in a run or asset folder. truth_folder: what `relit synthesize` wrote; or the
+    capture that the asset was made from, whose photos are the truth then (evaluate/photos.py).
 
     spp: samples a pixel of the pictures that are compared; their noise counts as error. Returns {"metrics": {name: {"value", "unit",
     "definition"}}, "per_view": {view: {name: value}}, "albedo_scale": [r, g, b], "alignment": "identity" or "sim3"}.
@@ -133,11 +88,16 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     """
     from relit.asset.asset import load_asset
 
-    asset, truth = load_asset(run_or_asset), load_truth(truth_folder)
-    result = evaluate_asset(asset, truth, spp=spp, seed=seed)
+    asset = load_asset(run_or_asset)
+    if has_truth(truth_folder):
+        result = evaluate_asset(asset, load_truth(truth_folder), spp=spp, seed=seed)
+    else:
+        from relit.evaluate.photos import evaluate_on_photos
+
+        result = evaluate_on_photos(asset, Path(truth_folder), run=Path(run_or_asset), spp=spp, seed=seed)
     value = glb_roundtrip(asset, Path(run_or_asset) / "stages" / "asset")
     if value is not None:
-        result["metrics"].update(_entry("glb_roundtrip_psnr", value))
+        result["metrics"].update(entry("glb_roundtrip_psnr", value))
     return result
 
 
@@ -146,7 +106,7 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
     from relit.rendering.mitsuba_scene import build_scene
 
     recovered = {camera_key(name): camera for name, camera in asset.cameras}
-    asset, alignment = aligned(asset, truth, recovered)
+    asset, alignment = aligned(asset, truth.train, recovered)
     world_from_asset = asset.world_from_asset
     values: dict[str, float] = {}
     per_view: dict[str, dict[str, float]] = {name: {} for name in truth.test}
@@ -180,7 +140,7 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
         values["camera_centre_percent"] = float(100 * np.median(distances) / (2 * truth.radius))
     values = {**_means(per_view), **values}
     return {
-        "metrics": {k: v for name in DEFINITIONS if name in values for k, v in _entry(name, values[name]).items()},
+        "metrics": {k: v for name in DEFINITIONS if name in values for k, v in entry(name, values[name]).items()},
         "per_view": per_view,
         "albedo_scale": [float(x) for x in scale],
         "alignment": alignment,
@@ -190,14 +150,14 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
 # ---------------------------------------------------------------- frames
 
 
-def aligned(asset: Asset, truth: Truth, recovered: dict[str, Camera]) -> tuple[Asset, str]:
-    """The asset carried into the truth's frame, and how: 'identity' when its cameras stand there already (they were given) or it has
-    none, 'sim3' when they were recovered from photos and the frame is free."""
+def aligned(asset: Asset, truth: dict[str, Camera], recovered: dict[str, Camera]) -> tuple[Asset, str]:
+    """The asset carried into the frame of the true cameras, and how: 'identity' when its cameras stand there already (they were given) or
+    it has none, 'sim3' when they were recovered from photos and the frame is free."""
     from relit.conventions import move_pose
 
-    if not recovered or same_frame(recovered, truth.train):
+    if not recovered or same_frame(recovered, truth):
         return asset, "identity"
-    s = align_cameras(recovered, truth.train)
+    s = align_cameras(recovered, truth)
     environment = None if asset.environment is None else rotate_environment(asset.environment, s)
     cameras = tuple((name, camera.with_pose(move_pose(s, camera.world_from_camera))) for name, camera in asset.cameras)
     return replace(asset, world_from_asset=s @ asset.world_from_asset, environment=environment, cameras=cameras), "sim3"
@@ -350,7 +310,7 @@ def chamfer_figures(mesh: Mesh, world_from_asset, truth: Truth, count: int = SUR
 # ---------------------------------------------------------------- results
 
 
-def _entry(name: str, value: float) -> dict[str, dict[str, Any]]:
+def entry(name: str, value: float) -> dict[str, dict[str, Any]]:
     unit, definition = DEFINITIONS[name]
     return {name: {"value": float(value), "unit": unit, "definition": definition}}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 from relit.errors import EXIT_USAGE, UserError
@@ -26,9 +27,20 @@ def do_export(args) -> None:
     print(args.out)
 
 
+def scale(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(p) for p in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in (1, 3) or not all(0 < v < 1e6 for v in values):
+        raise argparse.ArgumentTypeError(f"'{text}' is not one number or R,G,B, each above 0")
+    return values
+
+
 def relight_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
-    parser.common.add_argument("--light", required=True, type=Path, metavar="FILE", help="lat-long .hdr or .exr")
+    light = "lat-long .hdr or .exr, or spherical Gaussians in a .json"
+    parser.common.add_argument("--light", required=True, type=Path, metavar="FILE", help=light)
     out_flag(parser, "folder of pictures, or FILE.mp4")
     add = parser.common.add_argument
     add("--cameras", default="capture", metavar="WHICH", help="capture (default), orbit:N for a turntable, or a transforms.json")
@@ -37,6 +49,7 @@ def relight_flags(parser: Parser) -> None:
     more("--spp", type=int, default=64, help="samples a pixel (default 64)")
     more("--size", type=int, default=None, metavar="PIXELS", help="longer side of the pictures")
     more("--rotate", type=float, default=0.0, metavar="DEGREES", help="turn the light about the object's up")
+    more("--albedo-scale", type=scale, default=None, metavar="S or R,G,B", help="multiplies the base colour")
     more("--exr", action="store_true", help="linear EXR pictures besides the PNG ones")
     more("--overwrite", action="store_true", help="replace existing pictures")
 
@@ -56,6 +69,7 @@ def do_relight(args) -> None:
         progress.update(done)
 
     options = {"cameras": args.cameras, "spp": args.spp, "size": args.size, "exr": args.exr, "rotate": args.rotate}
+    options["albedo_scale"] = args.albedo_scale
     relight(args.run, args.light, args.out, progress=show, **options)
     progress.log.clear()
     print(args.out)

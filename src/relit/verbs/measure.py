@@ -11,10 +11,11 @@ from relit.verbs.parser import DEVICES, Parser, job_flags, path_in
 
 def evaluate_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
-    parser.common.add_argument("--truth", required=True, type=Path, metavar="DIR", help="folder that relit synthesize wrote")
+    truth = "what relit synthesize wrote, or the capture itself: its held-out photos"
+    parser.common.add_argument("--truth", required=True, type=Path, metavar="DIR", help=truth)
     parser.common.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the figures there")
     parser.common.add_argument("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
-    parser.more.add_argument("--spp", type=int, default=128, help="samples a pixel of the compared pictures (default 128)")
+    parser.more.add_argument("--spp", type=int, default=256, help="samples a pixel of the compared pictures (default 256)")
 
 
 def do_evaluate(args) -> None:
