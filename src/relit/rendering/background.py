@@ -39,33 +39,45 @@ def contract(x):
 
 
 def render_background(field: Background, o, d, jitter):
-    """Radiance (Color3f) that reaches the object sphere from behind along rays o + t d; differentiable in field.cells only.
+    """Radiance (Color3f) that reaches the object sphere from behind along rays o + t d; differentiable in field.cells, o and d.
 
     Rays that miss the sphere start at their point closest to the origin. jitter: Float in [0, 1).
     """
-    return _emission(field, *_samples(field, o, d, jitter, 0))[0]
+    depths = sample_depths(field, o, d, jitter, 0)
+    return emission(field, o, d, depths)[0]
 
 
 def render_everything(field: Background, o, d, jitter, inside: int):
     """Radiance (Color3f) along whole rays, with `inside` samples within the object sphere before those behind it: the field alone, before
     there is a surface. Also the mean density within the sphere (Float, per ray). What stands between camera and sphere is not seen."""
-    t, length, ray, k = _samples(field, o, d, jitter, inside)
-    rgb, density, _ = _emission(field, t, length, ray, k)
-    within = mi.Float(dr.tile(dr.arange(mi.UInt32, k), dr.width(d))) < inside
-    return rgb, dr.block_sum(dr.select(within, density * length, 0), k)
+    depths = sample_depths(field, o, d, jitter, inside)
+    rgb, density, _ = emission(field, o, d, depths)
+    within = mi.Float(dr.tile(dr.arange(mi.UInt32, depths.count), dr.width(d))) < inside
+    return rgb, dr.block_sum(dr.select(within, density * depths.length, 0), depths.count)
 
 
 def median_depth(field: Background, o, d, inside: int):
     """Distance (Float) at which half the light along each ray is absorbed; detached."""
     with dr.suspend_grad():
-        t, length, ray, k = _samples(field, o, d, dr.full(mi.Float, 0.5, dr.width(d)), inside)
-        _, _, before = _emission(field, t, length, ray, k)
-        visible = dr.select(dr.exp(-before) > 0.5, t[0], 0)
-        return dr.block_reduce(dr.ReduceOp.Max, visible, k)
+        depths = sample_depths(field, o, d, dr.full(mi.Float, 0.5, dr.width(d)), inside)
+        _, _, before = emission(field, o, d, depths)
+        visible = dr.select(dr.exp(-before) > 0.5, depths.t, 0)
+        return dr.block_reduce(dr.ReduceOp.Max, visible, depths.count)
 
 
-def _samples(field: Background, o, d, jitter, inside: int):
-    """Sample positions: (distance, position), lengths for the density, ray of each, number per ray. Detached."""
+@dataclass
+class Depths:
+    """Where rays are sampled, `count` times each, ray by ray. t: Float, distance along the ray. length: Float, what the density is
+    multiplied with; -1: opaque. ray: UInt32. All constants of the quadrature."""
+
+    t: Any
+    length: Any
+    ray: Any
+    count: int
+
+
+def sample_depths(field: Background, o, d, jitter, inside: int) -> Depths:
+    """`inside` samples between entry and exit of the object sphere, then field.samples behind it. Detached."""
     k = inside + field.samples
     with dr.suspend_grad():
         o, d = dr.detach(mi.Vector3f(o)), dr.detach(mi.Vector3f(d))
@@ -76,7 +88,6 @@ def _samples(field: Background, o, d, jitter, inside: int):
         rays = dr.width(d)
         ray = dr.repeat(dr.arange(mi.UInt32, rays), k)
         j = mi.Float(dr.tile(dr.arange(mi.UInt32, k), rays))
-        oo, dd = dr.gather(mi.Vector3f, o, ray), dr.gather(mi.Vector3f, d, ray)
         t0, t1, jit = dr.gather(mi.Float, near, ray), dr.gather(mi.Float, far, ray), dr.gather(mi.Float, jitter, ray)
         # behind the sphere t - t1 = u / (1 - u), u uniform in [0, 1): uniform in inverse distance
         i = dr.maximum(j - inside, 0)
@@ -88,18 +99,18 @@ def _samples(field: Background, o, d, jitter, inside: int):
         t = dr.select(is_inside, t0 + (j + jit) * step, t1 + reach)
         length = dr.select(is_inside, step, behind)
         length = dr.select(j == k - 1, -1, length)  # what lies farthest is opaque: every ray ends somewhere
-        return (t, oo + dd * t), length, ray, k
+        return Depths(t, length, ray, k)
 
 
-def _emission(field: Background, at, length, ray, k):
-    """Radiance per ray, density per sample, optical depth before each sample."""
-    n = field.n
-    with dr.suspend_grad():
-        p = contract(at[1])
-        q = [dr.clip((c * 0.25 + 0.5) * (n - 1), 0, n - 1.001) for c in (p.x, p.y, p.z)]
-        base = [mi.UInt32(c) for c in q]
-        f = [c - mi.Float(b) for c, b in zip(q, base, strict=False)]
-        node = (base[2] * n + base[1]) * n + base[0]
+def emission(field: Background, o, d, depths: Depths):
+    """Radiance per ray, density per sample, optical depth before each sample; differentiable in field.cells, o and d."""
+    n, k = field.n, depths.count
+    x = dr.gather(mi.Vector3f, mi.Vector3f(o), depths.ray) + dr.gather(mi.Vector3f, mi.Vector3f(d), depths.ray) * depths.t
+    p = contract(x)
+    q = [dr.clip((c * 0.25 + 0.5) * (n - 1), 0, n - 1.001) for c in (p.x, p.y, p.z)]
+    base = [mi.UInt32(dr.detach(c)) for c in q]
+    f = [c - mi.Float(b) for c, b in zip(q, base, strict=False)]
+    node = (base[2] * n + base[1]) * n + base[0]
     value = mi.Vector4f(0)
     for dz in (0, 1):
         for dy in (0, 1):
@@ -107,7 +118,7 @@ def _emission(field: Background, at, length, ray, k):
                 w = (f[0] if dx else 1 - f[0]) * (f[1] if dy else 1 - f[1]) * (f[2] if dz else 1 - f[2])
                 value = dr.fma(dr.gather(mi.Vector4f, field.cells, node + (dz * n + dy) * n + dx), w, value)
     density = softplus(value.x)
-    tau = dr.select(length < 0, 30.0, density * length)
+    tau = dr.select(depths.length < 0, 30.0, density * depths.length)
     before = dr.block_prefix_sum(tau, k)  # exclusive
     weight = dr.exp(-before) * (1 - dr.exp(-tau))
     rgb = dr.exp(dr.clip(mi.Color3f(value.y, value.z, value.w), -12, 6))

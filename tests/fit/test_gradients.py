@@ -1,0 +1,155 @@
+"""Every parameter that a fit moves, against finite differences of the loss that moves it, on small scenes.
+
+The table PARAMETERS is the list: a new learnable parameter gets its line here.
+"""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from relit.capture.synthetic import look_at
+from relit.conventions import environment_directions
+from relit.fit.losses import display_loss, mask_loss, normal_loss
+from relit.fit.pixels import batch_of, make_bank
+from relit.geometry.sdf import make_grid, node_positions
+from relit.rendering import background as bg
+from relit.rendering.march import march, sphere_interval
+from relit.rendering.shade import CHANNELS, COLUMNS, ROWS, shade
+from relit.scene import Camera
+
+PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
+    "distances": (("volume", "saddle"), 1e-4),
+    "features": (("volume", "saddle"), 2e-3),
+    "reflections": (("volume", "saddle"), 1e-2),
+    "background": (("volume",), 1e-2),
+    "rotations": (("matt", "saddle"), 1e-4),
+    "translations": (("matt", "saddle"), 2e-4),
+}
+N, SIZE, VIEWS = 16, 10, 4
+ROUND = ([2.5, 0.3, 0.2], [-1, 2, 1], [0.2, -0.8, 2.4], [0.4, 1.5, -2])
+ABOVE = ([0.5, 0.3, 2.2], [-0.5, 0.6, 2.0], [0.2, -0.8, 2.4], [0.4, 0.7, 2.0])
+
+
+def smooth_map() -> np.ndarray:
+    """Log radiance that changes little from texel to texel: the kinks of a bilinear look-up are none of a gradient's."""
+    d = environment_directions(ROWS, COLUMNS)
+    waves = [np.sin(2 * d[..., k] + c) * np.cos(1.5 * d[..., (k + 1) % 3]) for k, c in enumerate((0.3, 1.0, 2.0))]
+    return (np.stack(waves, -1) * 0.8 - 1).astype(np.float32).ravel()
+
+
+class VolumeScene:
+    """The volume pass's loss for a fixed set of rays: colour, mask and normal terms, reflections, background.
+
+    The derivative of a normal with respect to the ray is that of the trilinear interpolant within its cells: from cell to cell the normal
+    jumps, which no derivative knows. So camera corrections are tested on a lumpy object without anything that sees normals (`matt`), and
+    on a saddle, a polynomial that trilinear interpolation holds exactly.
+    """
+
+    def __init__(self, kind):
+        rng = np.random.default_rng(0)
+        p = node_positions(N)
+        x, y, z = np.moveaxis(p.astype(np.float64), -1, 0)
+        values = np.linalg.norm(p - np.array([0.1, 0, 0.05]), axis=-1) - 0.55 + 0.05 * np.sin(5 * x) * np.cos(4 * y)
+        if kind == "saddle":  # seen from one side, near its middle: where it leaves the sphere the quadrature ends within the surface
+            values = z + 0.1 * x + 0.25 * x * y - 0.2 * y * z + 0.1 * x * y * z - 0.05
+        features = rng.uniform(0.1, 0.6, (N, N, N, CHANNELS))
+        features[..., 3] *= kind != "matt"
+        self.normal = 0.0 if kind == "matt" else 0.1
+        self.grid = make_grid(values.astype(np.float32), CHANNELS, band=np.inf, features=features.astype(np.float32))
+        cameras, images, masks, normals = [], [], [], []
+        focal = 40.0 if kind == "saddle" else 14.0
+        for o in ABOVE if kind == "saddle" else ROUND:
+            cameras.append(Camera(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2, look_at(o)))
+            images.append(rng.uniform(0, 0.9, (SIZE, SIZE, 3)).astype(np.float32))
+            masks.append(np.ones((SIZE, SIZE), np.float32))
+            n = rng.normal(size=(SIZE, SIZE, 3))
+            normals.append((n / np.linalg.norm(n, axis=-1, keepdims=True)).astype(np.float32))
+        self.bank = make_bank(cameras, images, masks, normals)
+        self.pixel = mi.UInt32(np.arange(self.bank.total, dtype=np.uint32))
+        cells = rng.normal(size=(8**3, 4)) * [1.5, 0.7, 0.7, 0.7] - [1.0, 1.0, 1.0, 1.0]
+        self.field = bg.Background(8, mi.Float(cells.astype(np.float32).ravel()), 12)
+        self.inv_s, self.dt = dr.opaque(mi.Float, 1.0 / self.grid.h), dr.opaque(mi.Float, 0.1 * self.grid.h)
+        self.start = {
+            "distances": np.array(self.grid.row_values),
+            "features": np.array(self.grid.features),
+            "reflections": smooth_map(),
+            "background": np.array(self.field.cells),
+            "rotations": rng.normal(size=3 * VIEWS).astype(np.float32) * 0.01,
+            "translations": rng.normal(size=3 * VIEWS).astype(np.float32) * 0.01,
+        }
+        # positions along the rays are constants of the quadrature: those of the unchanged parameters
+        batch = self.batch({k: mi.Float(v) for k, v in self.start.items()})
+        self.t0, self.t1 = sphere_interval(batch.o, batch.d)
+        # masks near the opacity that is there: far from it the logarithm is so steep that no step is small enough
+        opacity = march(self.grid, batch.o, batch.d, self.t0, self.t1, self.inv_s, self.dt).opacity
+        dr.scatter(self.bank.rgbm, 0.9 * opacity, dr.arange(mi.UInt32, self.bank.total) * 4 + 3)
+        self.depths = bg.sample_depths(self.field, batch.o, batch.d, mi.Float(rng.uniform(0, 1, self.bank.total)), 0)
+
+    def batch(self, x):
+        row = dr.arange(mi.UInt32, 6 * VIEWS)
+        view, k = row // 6, row % 6
+        turn = dr.gather(mi.Float, x["rotations"], view * 3 + k, k < 3)
+        corrections = turn + dr.gather(mi.Float, x["translations"], view * 3 + k - 3, k >= 3)
+        return batch_of(self.bank, self.pixel, corrections)
+
+    def loss(self, x):
+        grid = self.grid
+        grid.row_values, grid.features = x["distances"], x["features"]
+        dr.scatter(grid.values, dr.gather(mi.Float, dr.detach(x["distances"]), dr.arange(mi.UInt32, grid.rows - 1) + 1), grid.nodes)
+        batch = self.batch(x)
+        m = march(grid, batch.o, batch.d, self.t0, self.t1, self.inv_s, self.dt)
+        colour, normal = shade(m, batch.d, x["reflections"])
+        behind = bg.emission(replace(self.field, cells=x["background"]), batch.o, batch.d, self.depths)[0]
+        loss = display_loss(colour + m.transmittance * behind, batch.rgb) + 0.5 * mask_loss(m.opacity, batch.mask)
+        return loss + self.normal * normal_loss(normal, batch.normal, batch.has_normal * m.opacity)
+
+
+SCENES = {kind: lambda k=kind: VolumeScene(k) for kind in ("volume", "matt", "saddle")}
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Each scene once, with its gradients."""
+    import relit.rendering.march as module
+
+    patch = pytest.MonkeyPatch()
+    for name, off in {"MIN_ALPHA": 0.0, "MIN_TRANSMITTANCE": 0.0, "ACCELERATE": 1e3}.items():
+        patch.setattr(module, name, off)  # what crosses a threshold, or a step that grows, moves the quadrature: that is no gradient's
+    found = {}
+    for name, make in SCENES.items():
+        scene = make()
+        x = {k: mi.Float(v) for k, v in scene.start.items()}
+        dr.enable_grad(*x.values())
+        dr.backward(scene.loss(x))
+        found[name] = scene, {k: np.array(dr.grad(v)) for k, v in x.items()}
+    yield found
+    patch.undo()
+
+
+def difference(scene, name, direction, step):
+    def at(s):
+        changed = scene.start[name] + np.float32(s * step) * direction
+        return float(scene.loss({**{k: mi.Float(v) for k, v in scene.start.items()}, name: mi.Float(changed)})[0])
+
+    return (at(1) - at(-1)) / (2 * step)
+
+
+@pytest.mark.parametrize("name, where", [(name, where) for name, (scenes, _) in PARAMETERS.items() for where in scenes])
+def test_gradient_agrees_with_finite_differences(scenes, name, where):
+    """Along the sign of the gradient, over all entries and over four parts of them, so that errors of opposite sign cannot hide."""
+    step = PARAMETERS[name][1]
+    scene, gradients = scenes[where]
+    g = gradients[name]
+    assert np.isfinite(g).all() and np.count_nonzero(g) > 0.02 * g.size
+    kind = np.arange(g.size) * 4 // g.size
+    for chosen in (np.ones(g.size, bool), *(kind == k for k in range(4))):
+        direction = (np.sign(g) * chosen).astype(np.float32)
+        expected = float((g.astype(np.float64) * direction).sum())
+        assert difference(scene, name, direction, step) == pytest.approx(expected, rel=0.02), chosen.mean()
+
+
+def test_the_list_is_complete(scenes):
+    assert {name for scene, _ in scenes.values() for name in scene.start} == set(PARAMETERS)
