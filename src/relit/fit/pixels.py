@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from relit.cameras.se3 import exp_so3
 from relit.scene import Camera
 
 CAMERA_FLOATS = 16  # fx fy cx cy, then the 3x4 pose row by row
@@ -75,7 +76,9 @@ def make_bank(cameras: list[Camera], images: list[np.ndarray], masks: list[np.nd
             nk = normals[k]
             packed = np.zeros((h, w, 4), np.float32)
             if nk is not None:
-                packed[..., :3], packed[..., 3] = nk, np.abs(nk).sum(-1) > 0.1
+                length = np.linalg.norm(nk, axis=-1)  # shrinking a photo averages its normals
+                packed[..., :3] = nk / np.maximum(length, 1e-6)[..., None]
+                packed[..., 3] = length > 0.1
             extra.append(packed.reshape(-1))
     return PixelBank(
         len(images),
@@ -102,23 +105,40 @@ def sphere_pixels(camera: Camera, radius: float) -> np.ndarray:
 
 
 def rays_through(cameras, view, x, y, corrections=None):
-    """Rays (o, d) through pixel positions x, y (Floats in pixels, centres at +.5) of `view`; differentiable in `corrections`."""
+    """Rays (o, d) through pixel positions x, y (Floats in pixels, centres at +.5) of `view`; differentiable in `corrections`.
+
+    A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by the translation, both in the unit frame.
+    """
     k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
     d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
     o = mi.Vector3f(k[1].w, k[2].w, k[3].w)
     if corrections is not None:
         c = [dr.gather(mi.Float, corrections, view * 6 + j) for j in range(6)]
-        d = dr.normalize(d + dr.cross(mi.Vector3f(c[0], c[1], c[2]), d))
+        w = mi.Vector3f(c[0], c[1], c[2])
+        theta2 = dr.squared_norm(w)  # Rodrigues' formula by its series, right to 1e-6 for corrections below half a radian
+        turned = dr.cross(w, d)
+        d = d + (1 - theta2 / 6 * (1 - theta2 / 20)) * turned + (0.5 - theta2 / 24 * (1 - theta2 / 30)) * dr.cross(w, turned)
         o = o + mi.Vector3f(c[3], c[4], c[5])
     return o, d
+
+
+def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
+    """The cameras with their corrections, (views * 6), built in."""
+    out = []
+    for camera, c in zip(cameras, np.asarray(corrections, np.float64).reshape(-1, 6), strict=True):
+        pose = np.array(camera.world_from_camera, np.float64)
+        pose[:3, :3] = exp_so3(c[:3]) @ pose[:3, :3]
+        pose[:3, 3] += c[3:]
+        out.append(camera.with_pose(pose))
+    return out
 
 
 def locate(bank: PixelBank, pixel):
     """View, column and row (UInt32) of flat pixel numbers."""
     view = dr.binary_search(0, bank.views, lambda k: dr.gather(mi.UInt32, bank.offsets, k, k < bank.views) <= pixel) - 1
     local = pixel - dr.gather(mi.UInt32, bank.offsets, view)
-    width = dr.gather(mi.UInt32, bank.widths, view)
+    width = dr.maximum(dr.gather(mi.UInt32, bank.widths, view), 1)  # unused lanes of a vector register read 0: a division by it is a crash
     row = local // width
     return view, local - row * width, row
 
