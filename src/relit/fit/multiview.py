@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from relit.cameras.se3 import align_cameras, nearest_rotation
 from relit.conventions import move_points, move_pose, similarity, srgb_from_linear
 from relit.errors import UserError, did_you_mean
 from relit.files import write_text
 from relit.fit.explore import explore, first_shape
-from relit.fit.pixels import PixelBank, make_bank, sphere_pixels
+from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras, sphere_pixels
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
 from relit.geometry.atlas import unwrap
@@ -120,15 +121,39 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
         parts = run_arrays(run, "mesh", "mesh")
     else:
         model = volume_stage(bank, cameras, masks, level, run, options, seed)
-        score_held_out(capture, model, run)
+        score_held_out(capture, model, run, refined_cameras(cameras, run, options)[1])
         parts = mesh_stage(model, run, options)
+    cameras, parts = follow_cameras(bank, cameras, parts, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
 
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
     else:
         maps = surface_stage(bank, mesh, parts["radiance"], run, options, seed)
-    return assemble(capture, mesh, maps, world_from_unit)
+    poses = [move_pose(world_from_unit, c.world_from_camera) for c in cameras] if options.refine_cameras > 0 else None
+    return assemble(capture, mesh, maps, world_from_unit, poses)
+
+
+def refined_cameras(cameras: list[Camera], run, options: MultiviewOptions) -> tuple[list[Camera], np.ndarray]:
+    """The cameras (unit frame) with the corrections that the volume pass has found, and unit_from_found (4, 4): corrections can drift
+    together with the shape, so both are carried back to where the cameras were. Unchanged, and the identity, where cameras are exact."""
+    if options.refine_cameras <= 0:
+        return cameras, np.eye(4)
+    found = corrected(cameras, run_arrays(run, "volume", "checkpoint")["corrections"])
+    poses = np.array([c.world_from_camera for c in found])
+    unit_from_found = align_cameras(poses, np.array([c.world_from_camera for c in cameras]))
+    return [c.with_pose(move_pose(unit_from_found, pose)) for c, pose in zip(found, poses, strict=True)], unit_from_found
+
+
+def follow_cameras(bank: PixelBank, cameras: list[Camera], parts: dict[str, np.ndarray], run, options: MultiviewOptions):
+    """Refined cameras for the pixel bank, and the mesh in their frame; returns (cameras, parts)."""
+    cameras, unit_from_found = refined_cameras(cameras, run, options)
+    if options.refine_cameras <= 0:
+        return cameras, parts
+    place_cameras(bank, cameras)
+    turn = nearest_rotation(unit_from_found[:3, :3])
+    moved = move_points(unit_from_found, parts["vertices"]).astype(np.float32)
+    return cameras, {**parts, "vertices": moved, "normals": (parts["normals"] @ turn.T).astype(np.float32)}
 
 
 def load_pixels(capture: Capture, options: MultiviewOptions, run):
@@ -204,15 +229,18 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
     return model
 
 
-def score_held_out(capture: Capture, model: VolumeModel, run) -> None:
-    """Say how well the volume pass predicts the photos that the capture sets aside (never used in the fit); stages/volume/held_out.json."""
+def score_held_out(capture: Capture, model: VolumeModel, run, unit_from_found: np.ndarray) -> None:
+    """Say how well the volume pass predicts the photos that the capture sets aside (never used in the fit); stages/volume/held_out.json.
+
+    unit_from_found: see `refined_cameras`.
+    """
     if not capture.held_out or any(p.camera is None for p in capture.held_out):
         return
-    unit_from_world = np.linalg.inv(capture.sphere.world_from_unit)
+    found_from_world = np.linalg.inv(capture.sphere.world_from_unit @ unit_from_found)
     scores = {}
     for photo in capture.held_out:
         pixels = photo.load()
-        camera = photo.camera.with_pose(move_pose(unit_from_world, photo.camera.world_from_camera))
+        camera = photo.camera.with_pose(move_pose(found_from_world, photo.camera.world_from_camera))
         covered = sphere_pixels(camera, 1.0)
         if covered.any():
             shown = srgb_from_linear(np.clip(render_views(model, [camera])[0], 0, 1))
@@ -276,8 +304,11 @@ def vertex_areas(mesh: Mesh) -> np.ndarray:
     return out
 
 
-def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_from_unit: np.ndarray) -> Asset:
-    """The asset: +Y up where the capture knows its up direction; lengths in the units of the user's cameras."""
+def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_from_unit: np.ndarray, poses=None) -> Asset:
+    """The asset: +Y up where the capture knows its up direction; lengths in the units of the user's cameras.
+
+    poses: world_from_camera (4, 4) of each photo where the cameras were refined.
+    """
     up = np.array([0.0, 1.0, 0.0]) if capture.up is None else np.asarray(capture.up, np.float64)
     world_from_asset = similarity(rotation_from_y(up), capture.sphere.centre)
     asset_from_unit = np.linalg.inv(world_from_asset) @ world_from_unit
@@ -288,7 +319,8 @@ def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_fr
         normals=(mesh.normals @ rotation.T).astype(np.float32),
     )
     material = Material(maps["base_color"], maps["roughness"], maps["metallic"])
-    cameras = tuple((p.name, p.camera) for p in capture.photos)
+    poses = [p.camera.world_from_camera for p in capture.photos] if poses is None else poses
+    cameras = tuple((p.name, p.camera.with_pose(pose)) for p, pose in zip(capture.photos, poses, strict=True))
     return Asset(placed, material, world_from_asset, maps["environment"], cameras, {})
 
 

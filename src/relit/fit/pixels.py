@@ -134,6 +134,11 @@ def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
     return out
 
 
+def place_cameras(bank: PixelBank, cameras: list[Camera]) -> None:
+    """Let the bank's rays come from `cameras`, without corrections."""
+    bank.cameras, bank.corrections = mi.Float(camera_rows(cameras)), dr.zeros(mi.Float, 6 * bank.views)
+
+
 def locate(bank: PixelBank, pixel):
     """View, column and row (UInt32) of flat pixel numbers."""
     view = dr.binary_search(0, bank.views, lambda k: dr.gather(mi.UInt32, bank.offsets, k, k < bank.views) <= pixel) - 1

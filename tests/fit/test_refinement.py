@@ -1,0 +1,83 @@
+"""Camera refinement and normal priors on a capture that the test renders."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lump import cameras, distance_to_truth, shaken, write_cameras, write_photos
+
+from relit.cameras.se3 import camera_errors
+from relit.capture import open_capture
+from relit.conventions import move_points
+from relit.fit.multiview import MultiviewOptions, reconstruct
+from relit.run import Run
+from relit.scene import Sphere
+
+OPTIONS = MultiviewOptions(
+    levels=(24, 48), level_steps=(80, 120), rays=1024, faces=3000, texture=64, surface_steps=4, points=256, directions=16, light=8
+)
+BALL = Sphere(np.zeros(3), 0.75)
+
+
+def poses(some):
+    return np.array([c.world_from_camera for c in some])
+
+
+def fit(folder, out, **changes):
+    with Run.open(out, {}) as run:
+        return reconstruct(open_capture(folder, sphere=BALL), run, replace(OPTIONS, **changes), 0)
+
+
+def world_vertices(asset):
+    return move_points(asset.world_from_asset, asset.mesh.vertices)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    return write_photos(tmp_path_factory.mktemp("photos"), normals=1.0)
+
+
+@pytest.fixture(scope="module")
+def shaken_capture(photos, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shaken")
+    for file in photos.glob("r_??.exr"):
+        (folder / file.name).write_bytes(file.read_bytes())
+    write_cameras(folder, shaken(cameras(), 1.0, 0.02))
+    return folder
+
+
+def test_refinement_brings_cameras_and_shape_nearer_to_the_truth(shaken_capture, tmp_path):
+    before_angle, before_distance = camera_errors(poses(shaken(cameras(), 1.0, 0.02)), poses(cameras()))
+    plain = fit(shaken_capture, tmp_path / "plain")
+    refined = fit(shaken_capture, tmp_path / "refined", refine_cameras=2e-3)
+    np.testing.assert_allclose(poses(c for _, c in plain.cameras), poses(shaken(cameras(), 1.0, 0.02)), atol=1e-9)
+    angle, distance = camera_errors(poses(c for _, c in refined.cameras), poses(cameras()))
+    assert angle.mean() < 0.6 * before_angle.mean() and distance.mean() < 0.7 * before_distance.mean()
+    a, b = (distance_to_truth(world_vertices(asset)) for asset in (plain, refined))
+    assert b < 0.8 * a
+
+
+def volume_only(folder, out, normal):
+    """Distance from the truth after a few steps of the volume pass, and the loss terms that were reported."""
+    with Run.open(out, {}) as run:
+        options = replace(OPTIONS, level_steps=(40, 40), normal=normal)
+        asset = reconstruct(open_capture(folder, sphere=BALL), run, options, 0)
+    return distance_to_truth(world_vertices(asset))
+
+
+def test_normal_priors_from_files_help_and_the_wrong_sign_hurts(photos, tmp_path):
+    """The same photos, with true normals, none, and normals that point the other way."""
+    flipped = tmp_path / "flipped"
+    flipped.mkdir()
+    from relit.images import read_data, write_linear
+
+    for file in photos.iterdir():
+        if "_normal" not in file.name:
+            (flipped / file.name).write_bytes(file.read_bytes())
+        else:
+            write_linear(flipped / file.name, -read_data(file)[..., :3])
+    assert any("16 photos have normal priors" in n for n in open_capture(photos, sphere=BALL).notes)
+    none = volume_only(photos, tmp_path / "none", 0.0)
+    true = volume_only(photos, tmp_path / "true", 0.3)
+    wrong = volume_only(flipped, tmp_path / "wrong", 0.3)
+    assert true < 0.9 * none < none < wrong
