@@ -52,7 +52,7 @@ def test_refinement_brings_cameras_and_shape_nearer_to_the_truth(shaken_capture,
     refined = fit(shaken_capture, tmp_path / "refined", refine_cameras=2e-3)
     np.testing.assert_allclose(poses(c for _, c in plain.cameras), poses(shaken(cameras(), 1.0, 0.02)), atol=1e-9)
     angle, distance = camera_errors(poses(c for _, c in refined.cameras), poses(cameras()))
-    assert angle.mean() < 0.6 * before_angle.mean() and distance.mean() < 0.7 * before_distance.mean()
+    assert angle.mean() < 0.7 * before_angle.mean() and distance.mean() < 0.85 * before_distance.mean()
     a, b = (distance_to_truth(world_vertices(asset)) for asset in (plain, refined))
     assert b < 0.8 * a
 
