@@ -13,7 +13,8 @@ of step i, t in its middle) the loss is Σ w_i v_i + gT T_end, so
 
 and Σ_{j>i} w_j v_j is the known total (from the outputs of the forward pass) minus a running sum. Gradients go to the rows of
 the field and to ray origins and directions. Sample positions t along a ray are constants of the quadrature; `inv_s`,
-`t0`, `t1` and `dt` receive no gradient.
+`t0`, `t1` and `dt` receive no gradient. The trilinear ∇s jumps from cell to cell: of a normal that changes because the ray moves
+(not because the field does) only the change within cells reaches o and d.
 """
 
 from __future__ import annotations
