@@ -1,8 +1,8 @@
-# make setup | demo | test | lint | bench | validator | clean
+# make setup | demo | test | lint | bench | viewer | validator | clean
 VENV ?= .venv
 NICE ?=
 
-.PHONY: setup demo test lint bench validator clean
+.PHONY: setup demo test lint bench viewer validator clean
 .DEFAULT_GOAL := setup
 
 # virtual environment, wheels, libLLVM; returns at once when nothing has changed
@@ -13,7 +13,7 @@ setup:
 demo: setup
 	$(NICE) $(VENV)/bin/python -m relit demo -o runs/demo
 
-test: setup validator
+test: setup validator viewer
 	$(NICE) $(VENV)/bin/python -m pytest -q
 
 lint: setup
@@ -27,6 +27,15 @@ validator:
 	@if [ -f tools/validator/package.json ] && command -v npm >/dev/null && [ ! -e tools/validator/node_modules/.package-lock.json ]; then \
 	  (cd tools/validator && npm ci --silent --no-audit --no-fund) || echo "npm could not install the glTF validator; its tests are skipped" >&2; fi
 
+# the page of `relit view`, built into the package; without node the page and its tests are left out with a reason
+VIEWER := $(shell find viewer -path viewer/node_modules -prune -o -type f -print 2>/dev/null)
+viewer: src/relit/viewer/static/index.html
+src/relit/viewer/static/index.html: $(VIEWER)
+	@if command -v npm >/dev/null; then \
+	  (cd viewer && { [ node_modules/.package-lock.json -nt package-lock.json ] || npm ci --silent --no-audit --no-fund; } && npm run --silent build -- --logLevel warn) \
+	  || echo "npm could not build the page; relit view says so" >&2; \
+	else echo "no npm: the page of relit view is not built" >&2; fi
+
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache tools/validator/node_modules src/relit.egg-info
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache tools/validator/node_modules viewer/node_modules src/relit/viewer/static src/relit.egg-info
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -43,7 +43,7 @@ def test_overview_lists_what_there_is(capsys):
         code, out, _ = run(capsys, *argv)
         assert code == 0
         assert all(f"  {verb} " in out for verb in verbs.VERBS)
-        assert not any(f"  {later} " in out for later in ("view", "edit", "insert", "quadrants"))
+        assert not any(f"  {later} " in out for later in ("edit", "insert", "quadrants"))
     assert run(capsys, "--version")[1].startswith("relit 0.")
 
 
@@ -59,7 +59,7 @@ def test_every_verb_has_help_with_common_flags_first(capsys, verb):
     "argv, said",
     [
         (["recnstruct", "x"], "unknown verb 'recnstruct'. Did you mean 'reconstruct'?"),
-        (["view", "x"], "unknown verb 'view'"),
+        (["insrt", "x"], "unknown verb 'insrt'"),
         (["--qualty", "draft", "reconstruct"], "unknown flag '--qualty' before the verb"),
         (["reconstruct", "x", "-o", "y", "--qualty", "draft"], "unknown flag '--qualty'. Did you mean '--quality'?"),
         (["reconstruct", "x", "--overwite"], "Did you mean '--overwrite'?"),

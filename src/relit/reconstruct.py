@@ -63,6 +63,9 @@ def reconstruct(
             capture = with_cameras(capture, run, job)
         if not finished:
             _save(run, recipe.reconstruct(capture, run, options, job.seed), capture, kind, job, chosen)
+            from relit.viewer.photos import write_photos
+
+            write_photos(run.folder, capture)  # for `relit view`
         if report:
             from relit.evaluate.report import write_report
 

@@ -29,7 +29,8 @@ from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_secon
 CHECKPOINT_SECONDS = 20.0  # a checkpoint is due this long after the last one, later if writing one is slow
 CHECKPOINT_LONGEST = 60.0  # ... but never later than this
 METRICS_SECONDS = 0.5  # between two lines of metrics.jsonl
-OWNED = ("config.toml", "inputs.json", "evaluation.json", "log.txt", "metrics.jsonl", "stages", "previews", "asset", "report.html")
+FILES = ("config.toml", "inputs.json", "evaluation.json", "log.txt", "metrics.jsonl", "report.html")
+OWNED = (*FILES, "stages", "previews", "photos", "asset")
 
 
 class Terminated(BaseException):
@@ -157,7 +158,8 @@ class Stage:
         if losses and (now - self._written >= METRICS_SECONDS or i == self.steps):
             values = {key: float(v() if callable(v) else v) for key, v in losses.items()}
             self._written = now
-            record = {"stage": self.name, "step": i, "seconds": round(self.seconds, 3), **{k: _finite(v) for k, v in values.items()}}
+            of = {} if self.steps is None else {"of": self.steps}
+            record = {"stage": self.name, "step": i, **of, "seconds": round(self.seconds, 3), **{k: _finite(v) for k, v in values.items()}}
             with (self.run.folder / "metrics.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record) + "\n")
         self._progress.update(i, values)

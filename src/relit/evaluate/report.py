@@ -171,7 +171,7 @@ def _losses(run: Path) -> str:
     stages: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for record in read_metrics(run):
         for key, value in record.items():
-            if key not in ("stage", "step", "seconds") and isinstance(value, (int, float)):
+            if key not in ("stage", "step", "of", "seconds") and isinstance(value, (int, float)):
                 stages.setdefault(record["stage"], {}).setdefault(key, []).append((record["step"], value))
     plots = [curve(f"{stage}: {name}", points) for stage, named in stages.items() for name, points in named.items() if len(points) > 1]
     return f"<div class=row>{''.join(plots)}</div>" if plots else "<p>No losses were recorded.</p>"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from relit.verbs.after import do_export, do_relight, export_flags, relight_flags
+from relit.verbs.after import do_export, do_relight, do_view, export_flags, relight_flags, view_flags
 from relit.verbs.jobs import (
     demo_flags,
     do_demo,
@@ -24,8 +24,9 @@ VERBS: dict[str, Verb] = {
     "demo": Verb("renders its own object, reconstructs it, scores it, writes the report", demo_flags, do_demo),
     "inspect": Verb("what an input is recognised as, and what a reconstruction would take", inspect_flags, do_inspect),
     "reconstruct": Verb("photos into a relightable asset; giving the same command again resumes", reconstruct_flags, do_reconstruct),
-    "export": Verb("the asset as glb, obj, ply or a Mitsuba scene", export_flags, do_export),
+    "export": Verb("the asset as glb, obj, ply, a Mitsuba scene, or a page to send", export_flags, do_export),
     "relight": Verb("pictures of the asset under another light", relight_flags, do_relight),
+    "view": Verb("the page: object, light, photos against renders, a run at work", view_flags, do_view),
     "evaluate": Verb("every figure that a known truth allows, with its definition", evaluate_flags, do_evaluate),
     "synthesize": Verb("renders a capture with known truth", synthesize_flags, do_synthesize, SYNTHESIZERS),
     "benchmark": Verb("synthesize, reconstruct and evaluate over a suite", benchmark_flags, do_benchmark),

@@ -1,4 +1,4 @@
-"""export, relight: what is done with an asset."""
+"""export, relight, view: what is done with an asset."""
 
 from __future__ import annotations
 
@@ -12,18 +12,25 @@ from relit.verbs.parser import DEVICES, Parser, free, out_flag, path_in
 def export_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
     out_flag(parser, "file (or folder, for mitsuba) to write")
-    parser.common.add_argument("--format", choices=("glb", "obj", "ply", "mitsuba"), default=None, help="default: by the ending of -o")
+    forms = ("glb", "obj", "ply", "mitsuba", "html")
+    parser.common.add_argument("--format", choices=forms, default=None, help="default: by the ending of -o")
     parser.more.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    parser.more.add_argument("--no-photos", action="store_true", help="html: leave the photos out, a smaller file")
 
 
 def do_export(args) -> None:
-    kind = args.format or {".glb": "glb", ".obj": "obj", ".ply": "ply"}.get(args.out.suffix.lower())
+    kind = args.format or {".glb": "glb", ".obj": "obj", ".ply": "ply", ".html": "html"}.get(args.out.suffix.lower())
     if kind is None:
-        raise UserError("the form cannot be told from the ending of -o", fix="add --format glb, obj, ply or mitsuba", code=EXIT_USAGE)
+        raise UserError("the form cannot be told from the ending of -o", fix="add --format glb, obj, ply, mitsuba or html", code=EXIT_USAGE)
     free(args.out, args.overwrite)
-    from relit.asset.export import export_asset
+    if kind == "html":
+        from relit.viewer.export_html import export_html
 
-    export_asset(args.run, kind, args.out)
+        export_html(args.run, args.out, photos=not args.no_photos)
+    else:
+        from relit.asset.export import export_asset
+
+        export_asset(args.run, kind, args.out)
     print(args.out)
 
 
@@ -73,3 +80,18 @@ def do_relight(args) -> None:
     relight(args.run, args.light, args.out, progress=show, **options)
     progress.log.clear()
     print(args.out)
+
+
+def view_flags(parser: Parser) -> None:
+    path_in(parser, "run", "run folder (one at work too) or asset folder")
+    add = parser.common.add_argument
+    add("--no-browser", action="store_true", help="print the address only")
+    add("--port", type=int, default=0, help="port on 127.0.0.1 (default: a free one)")
+
+
+def do_view(args) -> None:
+    from relit.viewer.serve import run_server, serve_until_stopped
+
+    if not 0 <= args.port <= 65535:
+        raise UserError(f"--port {args.port} is no port", fix="choose 1024 to 65535", code=EXIT_USAGE)
+    serve_until_stopped(run_server(args.run, args.port), lambda text: print(text, flush=True), not args.no_browser)
