@@ -55,9 +55,9 @@ def decode(path: Path, upright: bool = True) -> tuple[np.ndarray, bool]:
             raise broken(path, "not a Radiance HDR file")
         return _finite(np.ascontiguousarray(array[..., ::-1]), path), True
     if suffix in RAW:
-        with rawpy().imread(str(path)) as raw:  # camera white balance, no automatic exposure, linear
-            array = raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True)
-        return array, True
+        flip = {} if upright else {"user_flip": 0}
+        with raw_file(path) as raw:  # camera white balance, no automatic exposure, linear
+            return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, **flip), True
     with pil(path) as image:
         try:
             if _is_sixteen_bit(path, suffix):
@@ -123,6 +123,19 @@ def pil(path: Path):
     with image:
         _too_large(path, *image.size)
         yield image
+
+
+@contextmanager
+def raw_file(path: Path):
+    """An open RAW file (rawpy.RawPy). Raises UserError where the package is missing, and for files that it cannot read."""
+    package = rawpy()
+    try:
+        with package.imread(str(path)) as raw:
+            _too_large(path, raw.sizes.width, raw.sizes.height)
+            yield raw
+    except package.LibRawError as error:
+        reason = error.args[0] if error.args else error
+        raise broken(path, reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)) from error
 
 
 def rawpy():

@@ -12,7 +12,8 @@ from PIL import Image as PilImage
 from PIL import ImageOps
 
 from relit.conventions import linear_from_srgb
-from relit.images.decode import FLOAT, RAW, broken, checked, decode, exr, hdr_size, pil, rawpy
+from relit.errors import UserError
+from relit.images.decode import FLOAT, RAW, broken, checked, decode, exr, hdr_size, pil, raw_file
 from relit.images.write import codes_of
 
 FULL_FRAME_DIAGONAL = 43.2666  # mm, of the 36 x 24 mm film that "35 mm equivalent" focal lengths refer to
@@ -122,9 +123,11 @@ def read_header(path: str | Path) -> Header:
         w, h = hdr_size(path)
         return Header(w, h)
     if suffix in RAW:
-        with rawpy().imread(str(path)) as raw:
-            w, h = (raw.sizes.height, raw.sizes.width) if raw.sizes.flip in (5, 6) else (raw.sizes.width, raw.sizes.height)
-        return Header(w, h)
+        with raw_file(path) as raw:
+            orientation = {3: 3, 5: 8, 6: 6}.get(raw.sizes.flip, 1)  # LibRaw's flip -> EXIF
+            w, h = raw.sizes.width, raw.sizes.height
+        w, h = (h, w) if orientation >= 5 else (w, h)
+        return Header(w, h, False, _raw_focal(path, w, h), orientation)
     with pil(path) as image:
         w, h = image.size
         # Pillow decodes a whole PNG to look for EXIF behind the pixels; what stands before them is enough here
@@ -147,6 +150,15 @@ def _focal(exif, width: int, height: int) -> float | None:
         return focal if focal > 0 and np.isfinite(focal) else None
     except (ValueError, TypeError, ZeroDivisionError, KeyError, OSError, SyntaxError):
         return None  # EXIF is a hint: a broken block is no reason to refuse the photo
+
+
+def _raw_focal(path: Path, width: int, height: int) -> float | None:
+    """EXIF focal length in pixels of a RAW file; most are TIFF files, in which Pillow finds it."""
+    try:
+        with pil(path) as image:
+            return _focal(image.getexif(), width, height)
+    except UserError:
+        return None
 
 
 def _unit(codes: np.ndarray) -> np.ndarray:
