@@ -151,6 +151,55 @@ def test_estimate_grows_with_photos_and_quality(capture, monkeypatch):
     check_memory(draft, "cpu")
 
 
+def test_estimate_at_the_measured_capture_is_what_was_measured(capture):
+    from dataclasses import replace
+
+    from relit.plan import MEASURED, MEASURED_PHOTOS
+
+    opened = open_input(capture, Job())
+    side = {"width": 400, "height": 400}
+    sixty = replace(opened, photos=tuple(replace(opened.photos[0], **side) for _ in range(MEASURED_PHOTOS)))
+    for quality, (seconds, memory) in MEASURED.items():
+        cost = estimate(sixty, Job(quality=quality))
+        assert (cost.seconds, cost.memory) == pytest.approx((seconds, memory), rel=0.1)  # draft shrinks them
+    assert estimate(replace(sixty, photos=sixty.photos * 2), Job()).seconds > MEASURED["standard"][0]
+
+
+def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, monkeypatch):
+    """`--capture auto` takes the kind that the reader told, and says so when there is no recipe for it."""
+    import sys
+    import types
+    from dataclasses import dataclass, replace
+
+    from relit import plan
+
+    @dataclass(frozen=True)
+    class Options:
+        steps: int = 3
+
+    def fit(capture, run, options, seed):
+        CALLS.append((options.steps, capture.has_cameras))
+        mesh, material = pawn(10, 14, 16)
+        return Asset(mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos))
+
+    recipe = types.ModuleType("stand_in_recipe")
+    recipe.options_for, recipe.reconstruct, recipe.LIGHT, recipe.STAGES = (lambda quality: Options()), fit, "a lamp", ("one",)
+    recipe.LEAST_PHOTOS, recipe.COST = 1, {"standard": (7.0, 1.0e9)}
+    monkeypatch.setitem(sys.modules, "stand_in_recipe", recipe)
+    opened = plan.open_input(capture, Job())
+    monkeypatch.setattr(plan, "open_input", lambda path, job: replace(opened, kind="flash"))
+    monkeypatch.delitem(plan.RECIPES, "flash", raising=False)
+    code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
+    assert code == 2 and "--capture flash is not available" in err
+    monkeypatch.setitem(plan.RECIPES, "flash", "stand_in_recipe")
+    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--set", "steps=5")[0] == 0
+    assert CALLS == [(5, True)] and load_asset(tmp_path / "run").meta["capture"] == "flash"
+    code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "other", "--set", "rays=5")
+    assert code == 2 and "known keys: steps" in err
+    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "m", "--capture", "multiview", "--quality", "draft")[0] == 0
+    assert CALLS[-1][0] == "fit"
+
+
 def test_inspect_changes_nothing(capsys, capture):
     before = sorted(capture.rglob("*"))
     code, out, _ = relit(capsys, "inspect", capture, "--json", "--quality", "high")

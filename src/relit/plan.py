@@ -18,7 +18,7 @@ from relit.settings import read_config, with_values
 KINDS = ("multiview", "flash", "duplicates", "collection")
 # The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture, run, options, seed) -> Asset.
 # and LIGHT (a phrase) and STAGES (names) for `relit inspect`. It may also hold FINDS_CAMERAS = True (photos without cameras come to it as
-# they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST ({quality: (seconds, bytes)}, see BASE).
+# they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST (see MEASURED).
 RECIPES = {"multiview": "relit.fit.multiview"}
 QUALITIES = ("draft", "standard", "high")
 JOB_KEYS = {"capture": str, "quality": str, "seed": int, "masks": str, "max_side": int, "focal": float, "sphere": list}
@@ -113,8 +113,9 @@ class Cost:
     disk: float
 
 
-# Measured on 2 cores at 36 photos of 256x256 and rounded up: (seconds, bytes) by quality, and what photos add.
-BASE = {"draft": (45.0, 0.7e9), "standard": (220.0, 1.2e9), "high": (1000.0, 2.5e9)}
+# Whole jobs on 2 cores with 60 photos of 400x400, cold start: (seconds, peak bytes) by quality, and what more photos or pixels add.
+MEASURED = {"draft": (30.0, 1.0e9), "standard": (150.0, 2.0e9), "high": (1000.0, 3.0e9)}
+MEASURED_PHOTOS, MEASURED_PIXELS = 60, 400 * 400
 SECONDS_PER_PHOTO = {"cameras": 3.0, "load": 0.05}
 BYTES_PER_PIXEL = 40.0  # a decoded photo and its share of the pixel bank
 
@@ -127,12 +128,13 @@ def estimate(capture: Capture, job: Job, kind: str = "multiview", options=None) 
     recipe = recipe_of(kind)
     pixels = sum(p.width * p.height for p in capture.photos)
     pixels = min(pixels, getattr(options or recipe.options_for(job.quality), "max_pixels", pixels))
-    seconds, memory = getattr(recipe, "COST", BASE)[job.quality]
-    seconds += len(capture.photos) * SECONDS_PER_PHOTO["load"]
+    seconds, memory = getattr(recipe, "COST", MEASURED)[job.quality]
+    seconds += (len(capture.photos) - MEASURED_PHOTOS) * SECONDS_PER_PHOTO["load"]
     if not capture.has_cameras and not getattr(recipe, "FINDS_CAMERAS", False):
         seconds += len(capture.photos) * SECONDS_PER_PHOTO["cameras"]
     largest = max((p.width * p.height for p in capture.photos), default=0)
-    return Cost(seconds, memory + BYTES_PER_PIXEL * (pixels + 2 * largest), 0.1e9 if job.quality == "draft" else 0.3e9)
+    memory += BYTES_PER_PIXEL * (pixels + 2 * largest - (MEASURED_PHOTOS + 2) * MEASURED_PIXELS)
+    return Cost(seconds, memory, 0.1e9 if job.quality == "draft" else 0.3e9)
 
 
 def check_memory(cost: Cost, device: str) -> None:
