@@ -1,5 +1,7 @@
 """The recipe on a capture that the test renders: shape, pictures, resume, steady-state kernels."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -148,6 +150,41 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
     assert [new for new, _, _ in late] == [0] * len(late)
     assert sum(seconds for _, seconds, _ in late) == 0
     assert len({count for _, _, count in late}) == 1
+
+
+@pytest.mark.parametrize("without", ["hull", "interreflection", "exchange", "material_prior", "colour_smoothing", "light_prior"])
+def test_every_ablation_changes_the_result(capture_folder, tmp_path, monkeypatch, without):
+    """Each named part really is a part: switched off, what it acts on is not reached, and the fit still ends in an asset."""
+    import relit.fit.multiview as multiview
+    import relit.fit.surface as surface
+
+    seen = {"blocked": 0.0}
+    options = replace(TINY, level_steps=(4, 4), surface_steps=3)
+    if without == "hull":
+        options = replace(options, level_steps=(0, 0))
+    else:
+        options = replace(options, without=(without,))
+    found = multiview.surface_options(options)
+    full = multiview.surface_options(TINY)
+    zeroed = {f.name for f in fields(found) if getattr(found, f.name) == 0 and getattr(full, f.name) != 0}
+    assert zeroed == set(multiview.WITHOUT.get(without, {}))
+    original = surface.sample_lights
+
+    def watched(*args):
+        lights = original(*args)
+        seen["blocked"] += float(np.abs(np.array(lights.blocked)).sum())
+        return lights
+
+    monkeypatch.setattr(surface, "sample_lights", watched)
+    with Run.open(tmp_path / "run", {}) as run:
+        asset = reconstruct(open_capture(capture_folder), run, options, 0)
+    assert np.isfinite(asset.material.base_color).all() and len(asset.mesh.faces) > 200
+    assert (seen["blocked"] == 0) == (without == "interreflection")
+
+
+def test_an_unknown_part_is_answered():
+    with pytest.raises(ValueError, match="Did you mean 'exchange'"):
+        MultiviewOptions(without=("exchang",))
 
 
 def test_unknown_quality():

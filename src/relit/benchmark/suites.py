@@ -80,6 +80,15 @@ MULTIVIEW = Suite(
         "glb_roundtrip_psnr": (">=", 35.0),
     },
     draft_bars={"seconds": ("<=", 90.0), "peak_memory": ("<=", 4.0)},
+    ablations={
+        "hull": ("level_steps=0,0,0",),  # the shape is the visual hull of the masks
+        "interreflection": ("without=interreflection",),
+        "exchange": ("without=exchange",),
+        "material_prior": ("without=material_prior",),
+        "colour_smoothing": ("without=colour_smoothing",),
+        "light_prior": ("without=light_prior",),
+        "priors": ("without=material_prior,colour_smoothing,light_prior",),
+    },
 )
 
 SUITES: dict[str, Suite] = {"multiview": MULTIVIEW}

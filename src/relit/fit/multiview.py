@@ -46,7 +46,7 @@ class MultiviewOptions:
     normal: weight of normal priors read from files. background, explore_steps: nodes a side of the radiance
     field for photos without masks, and the steps that fit it.
     faces: of the mesh, about. texture: texels a side. surface_steps, points, directions: steps of the surface pass, pixels per step,
-    directions per pixel. light: rows of the environment map.
+    directions per pixel. light: rows of the environment map. without: parts of the surface pass that are switched off, names of WITHOUT.
     """
 
     levels: tuple[int, ...] = (64, 128, 256)
@@ -63,7 +63,21 @@ class MultiviewOptions:
     points: int = 4096
     directions: int = 64
     light: int = 64
+    without: tuple[str, ...] = ()
 
+    def __post_init__(self):
+        for name in self.without:
+            if name not in WITHOUT:
+                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+
+
+WITHOUT = {  # what an ablation switches off: settings of the surface pass
+    "interreflection": {},  # what blocks a direction is black
+    "exchange": {"scale_rate": 0.0},
+    "material_prior": {"smooth_roughness": 0.0, "smooth_metallic": 0.0, "metallic_binary": 0.0, "metallic_sparse": 0.0},
+    "colour_smoothing": {"smooth_colour": 0.0},
+    "light_prior": {"light_smooth": 0.0, "light_neutral": 0.0},
+}
 
 PRESETS = {
     "draft": {
@@ -105,7 +119,8 @@ def volume_options(o: MultiviewOptions) -> VolumeOptions:
 
 
 def surface_options(o: MultiviewOptions) -> SurfaceOptions:
-    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light)
+    off = {key: value for name in o.without for key, value in WITHOUT[name].items()}
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **off)
 
 
 def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0) -> Asset:
@@ -282,7 +297,8 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
         start = fill_gutters(interpolate(guess, mesh.faces, face, bary), known)
         mean = float((radiance * areas[:, None]).sum() / areas.sum() / 3)
         model = start_surface(start, known, mean, o)
-        fit_surface(bank, TraceableMesh(mesh, radiance), model, o, stage, seed)
+        reflecting = radiance * (0.0 if "interreflection" in options.without else 1.0)
+        fit_surface(bank, TraceableMesh(mesh, reflecting), model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)
         maps = {
             "base_color": fill_gutters(base, known),
