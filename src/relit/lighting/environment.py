@@ -14,6 +14,28 @@ from relit.conventions import environment_solid_angles
 FLOOR = 0.02  # part of the samples that follow the solid angle alone, so that no direction is lost while texels change
 
 
+def latlong_uv(d):
+    """Position in the map, (u, v) in [0, 1), of unit directions: `conventions.uv_from_direction`."""
+    u = dr.atan2(d.x, -d.z) * dr.inv_two_pi
+    return u - dr.floor(dr.detach(u)), dr.safe_acos(d.y) * dr.inv_pi
+
+
+def lookup_latlong(texels, height: int, width: int, d, active=True):
+    """Bilinear look-up of a lat-long Float [height * width * 3] in unit directions d -> Color3f. Wraps in u, clamps in v.
+    Differentiable in `texels` and in `d` (except at the poles, where the gradient in d is zero)."""
+    polar = dr.square(d.x) + dr.square(d.z) < 1e-10
+    d = dr.select(polar, mi.Vector3f(0, dr.detach(d.y), -1e-6), d)
+    u, v = latlong_uv(d)
+    x, y = u * width - 0.5, dr.clip(v * height - 0.5, 0, height - 1)
+    x0, y0 = dr.floor(dr.detach(x)), dr.minimum(dr.floor(dr.detach(y)), max(height - 2, 0))
+    fx, fy = x - x0, y - y0
+    left = mi.UInt32(mi.Int32(x0) + width) % width
+    right, top = (left + 1) % width, mi.UInt32(y0) * width
+    below = top + (width if height > 1 else 0)
+    g = lambda k: dr.gather(mi.Color3f, texels, k, active)  # noqa: E731
+    return dr.lerp(dr.lerp(g(top + left), g(top + right), fx), dr.lerp(g(below + left), g(below + right), fx), fy)
+
+
 class Environment:
     """Radiance from infinitely far away.
 
@@ -66,34 +88,16 @@ class Environment:
             self._density = weight / (self._solid_angle * dr.gather(mi.Float, self._rows, mi.UInt32(h - 1)))
             dr.eval(self._density)
 
-    # ---------------------------------------------------------------- look-up
-
-    def _uv(self, d):
-        u = dr.atan2(d.x, -d.z) * dr.inv_two_pi
-        return u - dr.floor(u), dr.safe_acos(d.y) * dr.inv_pi
-
     def eval(self, d, active=True):
-        """Radiance (Color3f) from the unit direction `d`, bilinear, equal to `conventions.sample_environment`.
-        Differentiable in `radiance` and in `d` (except at the poles, where the gradient in d is zero)."""
-        h, w = self.height, self.width
-        polar = dr.square(d.x) + dr.square(d.z) < 1e-10
-        d = dr.select(polar, mi.Vector3f(0, dr.detach(d.y), -1e-6), d)
-        u, v = self._uv(d)
-        x, y = u * w - 0.5, dr.clip(v * h - 0.5, 0, h - 1)
-        x0, y0 = dr.floor(dr.detach(x)), dr.minimum(dr.floor(dr.detach(y)), max(h - 2, 0))
-        fx, fy = x - x0, y - y0
-        left = mi.UInt32(mi.Int32(x0) + w) % w
-        right, top = (left + 1) % w, mi.UInt32(y0) * w
-        below = top + (w if h > 1 else 0)
-        g = lambda k: dr.gather(mi.Color3f, self.radiance, k, active)  # noqa: E731
-        return dr.lerp(dr.lerp(g(top + left), g(top + right), fx), dr.lerp(g(below + left), g(below + right), fx), fy)
+        """Radiance (Color3f) from the unit direction `d`: `lookup_latlong`, equal to `conventions.sample_environment`."""
+        return lookup_latlong(self.radiance, self.height, self.width, d, active)
 
     # ---------------------------------------------------------------- sampling
 
     def pdf(self, d):
         """Density of `sample` in solid angle at the unit direction `d` (Float, detached)."""
         with dr.suspend_grad():
-            u, v = self._uv(d)
+            u, v = latlong_uv(d)
             x = dr.minimum(mi.UInt32(u * self.width), self.width - 1)
             y = dr.minimum(mi.UInt32(v * self.height), self.height - 1)
             return dr.gather(mi.Float, self._density, y * self.width + x)

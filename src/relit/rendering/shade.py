@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.lighting.environment import lookup_latlong
 from relit.rendering.march import Marched
 
 CHANNELS = 4
@@ -29,28 +30,12 @@ def start_features(level: np.ndarray) -> np.ndarray:
     return np.array([*level, 0.05], np.float32)
 
 
-def lookup_latlong(texels, height: int, width: int, d):
-    """Bilinear look-up of a lat-long Float [h * w * 3] in unit directions d -> Color3f; differentiable in texels and d.
-
-    Wraps in u, clamps in v.
-    """
-    u = dr.atan2(d.x, -d.z) * (0.5 * dr.inv_pi)
-    u = (u - dr.floor(dr.detach(u))) * width - 0.5
-    v = dr.clip(dr.safe_acos(dr.clip(d.y, -0.9999, 0.9999)) * dr.inv_pi * height - 0.5, 0, height - 1)
-    fu, fv = dr.floor(dr.detach(u)), dr.minimum(dr.floor(dr.detach(v)), height - 2)
-    x0, y0 = mi.Int32(fu), mi.UInt32(fv)
-    wx, wy = u - fu, v - fv
-    xa, xb = mi.UInt32(dr.select(x0 < 0, x0 + width, x0)), mi.UInt32(dr.select(x0 + 1 >= width, x0 + 1 - width, x0 + 1))
-    g = lambda x, y: dr.gather(mi.Color3f, texels, y * width + x)  # noqa: E731
-    top, bottom = dr.lerp(g(xa, y0), g(xb, y0), wx), dr.lerp(g(xa, y0 + 1), g(xb, y0 + 1), wx)
-    return dr.lerp(top, bottom, wy)
-
-
 def shade(m: Marched, d, reflections):
     """Radiance premultiplied with opacity (Color3f) and the unit normal (Vector3f) of each ray."""
     F = m.features
     n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
     r = d - 2 * dr.dot(d, n) * n
+    r = mi.Vector3f(r.x, dr.clip(r.y, -0.9999, 0.9999), r.z)  # the polar angle's slope has no bound at the poles
     e = dr.exp(lookup_latlong(reflections, ROWS, COLUMNS, r))
     return dr.maximum(mi.Color3f(F[0], F[1], F[2]) + dr.maximum(F[3], 0) * e, 0), n
 
