@@ -16,8 +16,9 @@ from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank
 from relit.geometry.sdf import make_grid, node_positions
 from relit.rendering import background as bg
+from relit.rendering import shade as shading
 from relit.rendering.march import march, sphere_interval
-from relit.rendering.shade import CHANNELS, COLUMNS, ROWS, shade
+from relit.rendering.shade import CHANNELS, shade
 from relit.scene import Camera
 
 PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
@@ -35,8 +36,9 @@ ABOVE = ([0.5, 0.3, 2.2], [-0.5, 0.6, 2.0], [0.2, -0.8, 2.4], [0.4, 0.7, 2.0])
 
 def smooth_map() -> np.ndarray:
     """Log radiance that changes little from texel to texel: the kinks of a bilinear look-up are none of a gradient's."""
-    d = environment_directions(ROWS, COLUMNS)
-    waves = [np.sin(2 * d[..., k] + c) * np.cos(1.5 * d[..., (k + 1) % 3]) for k, c in enumerate((0.3, 1.0, 2.0))]
+    sizes = shading.MAPS if hasattr(shading, "MAPS") else ((shading.ROWS, shading.COLUMNS),)
+    d = np.concatenate([environment_directions(*size).reshape(-1, 3) for size in sizes])
+    waves = [np.sin(2 * d[:, k] + c) * np.cos(1.5 * d[:, (k + 1) % 3]) for k, c in enumerate((0.3, 1.0, 2.0))]
     return (np.stack(waves, -1) * 0.8 - 1).astype(np.float32).ravel()
 
 
