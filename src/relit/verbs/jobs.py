@@ -39,6 +39,7 @@ def inspect_flags(parser: Parser) -> None:
     parser.common.add_argument("--json", action="store_true", help="print JSON")
     parser.common.add_argument("--quality", choices=QUALITIES, default="standard", help="for the estimate of time and memory")
     parser.common.add_argument("--plot", type=Path, default=None, metavar="FILE.svg", help="draw the cameras around the object sphere")
+    parser.common.add_argument("--html", type=Path, default=None, metavar="FILE.html", help="a page with all that was looked at")
     opening_flags(parser)
 
 
@@ -46,10 +47,11 @@ def do_inspect(args) -> None:
     from relit.plan import Job
     from relit.preflight import as_text, inspect
 
-    if args.plot is not None:
-        free(args.plot, overwrite=False)
+    for path in (args.plot, args.html):
+        if path is not None:
+            free(path, overwrite=False)
     job = Job(quality=args.quality, masks=args.masks or "auto", sphere=args.sphere, max_side=args.max_side)
-    found = inspect(args.input, job, args.plot)
+    found = inspect(args.input, job, args.plot, args.html)
     print(json.dumps(found, indent=2) if args.json else as_text(found))
 
 

@@ -1,0 +1,254 @@
+"""What kind of light the photos were taken under, guessed before anything is fitted.
+
+Four regimes: 'fixed' (the object and the lamps stand still, the camera moves), 'flash' (a lamp at the camera in a dark room),
+'varied' (each photo under another light), 'moving light' (one camera, and a lamp that moves). A guess comes with its evidence.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+
+from relit.preflight.look import Look, look_at_photos
+from relit.scene import Capture, Sphere
+
+SAME_VIEW = 0.38  # correlation of edges; .46 for six photos from one tripod under a moving lamp, below .28 where the camera moved
+SAME_PLACE = 0.45  # overlap of the surroundings' colours; .54 and .70 in one room, .19 to .47 for one object in several places
+DARK = 0.02  # linear: surroundings of a flash photo
+CELLS = (24, 48)  # of the object sphere's directions
+SAMPLES = 1500  # pixels of a photo
+
+
+def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
+    """{'guess': 'fixed' | 'flash' | 'varied' | 'moving light', 'confidence': 0 to 1, 'evidence': [sentences]}.
+
+    looks: the decoded copies, where they are at hand. A guess: photos with an alpha channel and no EXIF and no cameras say little,
+    and then the answer is 'fixed' with low confidence.
+    """
+    looks = look_at_photos(capture) if looks is None else looks
+    evidence: list[str] = []
+    votes = {"fixed": 0.4, "flash": 0.0, "varied": 0.0, "moving light": 0.0}
+    if len(looks) > 1 and _same_view(looks, evidence):
+        changes = shading_change(looks)
+        evidence.append(f"the shading of the same pixel changes by {100 * changes:.0f} % from photo to photo")
+        if changes > 0.08:
+            votes["moving light"] += 1.5
+    fired = [x.exif.flash for x in looks if x.exif.flash is not None]
+    if fired:
+        share = float(np.mean(fired))
+        evidence.append(f"EXIF: the flash fired in {100 * share:.0f} % of the photos that say")
+        votes["flash"] += 1.0 if share > 0.8 else 0.0
+        votes["fixed"] += 0.3 if share < 0.2 else 0.0
+    _surroundings(looks, votes, evidence)
+    if capture.sphere is not None and len([x for x in looks if x.camera is not None]) >= 4:
+        _shading(looks, capture.sphere, votes, evidence)
+    guess = max(votes, key=votes.get)
+    others = max(v for k, v in votes.items() if k != guess)
+    return {
+        "guess": guess,
+        "confidence": round(float(np.clip((votes[guess] - others) / max(votes[guess], 0.5), 0.05, 0.95)), 2),
+        "evidence": evidence,
+    }
+
+
+# ---------------------------------------------------------------- one camera
+
+
+def _same_view(looks: list[Look], evidence: list[str]) -> bool:
+    """Do all photos show the same view? From the poses where they are known, else from the edges."""
+    if all(x.camera is not None for x in looks):
+        centres = np.stack([x.camera.centre for x in looks])
+        turns = [np.trace(looks[0].camera.world_from_camera[:3, :3].T @ x.camera.world_from_camera[:3, :3]) for x in looks]
+        reach = np.abs(centres).max() + 1e-9
+        same = np.ptp(centres, axis=0).max() < 1e-3 * reach and min(turns) > 3 - 1e-4
+    else:
+        agreement = edge_agreement(looks)
+        same = agreement > SAME_VIEW
+        if same:
+            evidence.append(f"the edges of the photos lie over one another (correlation {agreement:.2f})")
+    if same:
+        evidence.append("all photos are taken from one place")
+    return bool(same)
+
+
+def edge_agreement(looks: list[Look]) -> float:
+    """Median correlation of the edge maps of neighbouring photos, pixel by pixel: high when the camera did not move."""
+    maps = []
+    for x in looks:
+        gray = cv2.resize(np.log(x.gray + 0.01), (128, 128), interpolation=cv2.INTER_AREA)
+        gray = cv2.GaussianBlur(gray, (0, 0), 1)
+        edges = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+        edges = np.minimum(edges, np.percentile(edges, 98))
+        maps.append((edges - edges.mean()) / max(edges.std(), 1e-6))
+    pairs = [float((a * b).mean()) for a, b in itertools.pairwise(maps)]
+    return float(np.median(pairs))
+
+
+def shading_change(looks: list[Look]) -> float:
+    """How much a pixel's share of the picture's brightness varies over photos from one place: upper tenth over bright pixels (of the
+    object where masks are known)."""
+    stack = np.stack([cv2.resize(x.gray, (96, 96), interpolation=cv2.INTER_AREA) for x in looks])
+    bright = stack.mean(0) > 0.25 * np.percentile(stack.mean(0), 95)
+    if all(x.mask is not None for x in looks):
+        inside = np.mean([cv2.resize(x.mask, (96, 96), interpolation=cv2.INTER_AREA) for x in looks], axis=0) > 0.9
+        bright = bright & inside if (bright & inside).sum() > 20 else bright
+    stack = stack / np.maximum(np.median(stack[:, bright], axis=1), 1e-6)[:, None, None]
+    return float(np.percentile((stack.std(0) / np.maximum(stack.mean(0), 1e-6))[bright], 90))
+
+
+# ---------------------------------------------------------------- what surrounds the object
+
+
+def _surroundings(looks: list[Look], votes: dict, evidence: list[str]) -> None:
+    seen = [x for x in looks if x.opaque]
+    if not seen:
+        evidence.append("the surroundings are cut away (alpha channel), so they say nothing about the light")
+        return
+    around = np.array([_around(x) for x in seen])  # (N, 3) median colour
+    level = np.log2(np.maximum(around.mean(1), 1e-4))
+    dark = float((around.mean(1) < DARK).mean())
+    if dark > 0.8:
+        evidence.append(f"the surroundings are dark in {100 * dark:.0f} % of the photos (below {DARK} of white)")
+        votes["flash"] += 0.6
+        return
+    chroma = around / np.maximum(around.sum(1, keepdims=True), 1e-6)
+    spread, tint = float(level.std()), float(chroma.std(0).max())
+    evidence.append(f"the surroundings vary by {spread:.1f} EV and {tint:.2f} in chromaticity between photos")
+    cameras = {x.exif.camera for x in seen if x.exif.camera}
+    sizes = {tuple(sorted(x.rgb.shape[:2])) for x in seen}
+    if len(cameras) > 2:
+        evidence.append(f"{len(cameras)} different cameras took the photos")
+        votes["varied"] += 0.7
+    if len(sizes) > max(2, len(seen) // 3):
+        evidence.append(f"the photos have {len(sizes)} different shapes")
+        votes["varied"] += 0.4
+    if spread > 1.0:
+        votes["varied"] += 0.35
+    if tint > 0.06:
+        votes["varied"] += 0.35
+    if len(seen) > 2:
+        overlap = colour_overlap(seen)
+        evidence.append(f"the colours around the object overlap by {100 * overlap:.0f} % from photo to photo")
+        votes["varied"] += 0.5 if overlap < SAME_PLACE else 0.0
+    if spread < 0.6 and tint < 0.04:
+        votes["fixed"] += 0.3
+
+
+def colour_overlap(looks: list[Look]) -> float:
+    """Median over pairs of photos of the intersection of the chromaticity histograms of their margins: 1 for equal ones."""
+    found = []
+    for x in looks:
+        h, w = x.rgb.shape[:2]
+        k = max(2, min(h, w) // 6)
+        margin = np.ones((h, w), bool)
+        margin[k:-k, k:-k] = False
+        rgb = x.rgb[margin]
+        chroma = rgb[:, :2] / (rgb.sum(1, keepdims=True) + 1e-3)
+        histogram, *_ = np.histogram2d(*chroma.T, bins=24, range=[[0.1, 0.6], [0.1, 0.6]])
+        found.append(cv2.GaussianBlur(histogram / max(histogram.sum(), 1), (0, 0), 0.7))
+    return float(np.median([np.minimum(a, b).sum() for i, a in enumerate(found) for b in found[:i]]))
+
+
+def _around(x: Look) -> np.ndarray:
+    h, w = x.rgb.shape[:2]
+    k = max(2, min(h, w) // 12)
+    border = np.ones((h, w), bool)
+    border[k:-k, k:-k] = False
+    if x.mask is not None:
+        border = x.mask < 0.05 if (x.mask < 0.05).mean() > 0.1 else border & (x.mask < 0.5)
+    return np.median(x.rgb[border], axis=0) if border.any() else np.zeros(3)
+
+
+# ---------------------------------------------------------------- shading of the object sphere
+
+
+def _shading(looks: list[Look], sphere: Sphere, votes: dict, evidence: list[str]) -> None:
+    found = shading_fits(looks, sphere)
+    if found is None:
+        return
+    spread, camera, photo, facing = found
+    evidence.append(
+        f"places of the object vary by {spread:.2f} (log) between photos; "
+        f"{100 * camera:.0f} % of that goes with the direction to the camera, {100 * photo:.0f} % with the photo"
+    )
+    if spread > 0.2 and camera > 0.3 and facing > 0.3:
+        evidence.append("what faces the camera is brightest: the light moves with it")
+        votes["flash"] += 0.9
+    elif spread > 0.3 and photo > 0.5:
+        votes["varied"] += 0.8
+    elif spread < 0.3 or photo < 0.4:
+        votes["fixed"] += 0.4
+
+
+def shading_fits(looks: list[Look], sphere: Sphere) -> tuple[float, float, float, float] | None:
+    """How brightness of one place of the object changes from photo to photo, the object taken for its sphere.
+
+    Places are cells of the sphere's directions, which takes texture out. -> (standard deviation of the log brightness about each
+    cell's mean; share of its variance that a linear function of the normal in CAMERA axes explains; share that a linear function of
+    the normal in WORLD axes, with another one for each photo, explains; the first function's slope towards the camera, per unit of
+    the normal's component), or None when too few places are seen often enough.
+    """
+    places, values, camera_normals, world_normals, photos = [], [], [], [], []
+    for i, x in enumerate(looks):
+        if x.camera is None:
+            continue
+        n, rgb = _on_sphere(x, sphere, i)
+        cell = _cell(n)
+        places.append(cell)
+        values.append(np.log(rgb + 0.004))
+        camera_normals.append(n @ x.camera.world_from_camera[:3, :3])
+        world_normals.append(n)
+        photos.append(np.full(len(n), i))
+    place, y, nc, nw, photo = (np.concatenate(a) for a in (places, values, camera_normals, world_normals, photos))
+    # mean over the pixels of a cell in a photo, then over photos
+    key = place * len(looks) + photo
+    keys, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    mean = lambda a: np.bincount(inverse, a) / count  # noqa: E731
+    y, nc, nw = mean(y), np.stack([mean(c) for c in nc.T], 1), np.stack([mean(c) for c in nw.T], 1)
+    place, photo = keys // len(looks), keys % len(looks)
+    places, inverse, count = np.unique(place, return_inverse=True, return_counts=True)
+    often = count[inverse] >= 4
+    if often.sum() < 60:
+        return None
+    about = lambda a: (a - (np.bincount(inverse, a) / count)[inverse])[often]  # noqa: E731
+    r = about(y)
+    total = float((r**2).mean())
+    if total < 1e-8:
+        return 0.0, 0.0, 0.0, 0.0
+    camera = np.stack([about(c) for c in nc.T], 1)
+    slope, *_ = np.linalg.lstsq(camera, r, rcond=None)
+    explained = 1 - float(((r - camera @ slope) ** 2).mean()) / total
+    left, photo, nw = r.copy(), photo[often], nw[often]
+    for i in np.unique(photo):
+        mine = photo == i
+        basis = np.concatenate([np.ones((mine.sum(), 1)), nw[mine]], 1)
+        if mine.sum() > 8:
+            left[mine] = r[mine] - basis @ np.linalg.lstsq(basis, r[mine], rcond=None)[0]
+    return float(np.sqrt(total)), explained, 1 - float((left**2).mean()) / total, float(-slope[2])
+
+
+def _on_sphere(x: Look, sphere: Sphere, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (N, 3), world, and luminance (N,) of pixels that meet the object sphere, at most SAMPLES of them."""
+    c = x.camera
+    rows, columns = np.nonzero(x.mask > 0.9) if x.mask is not None else np.nonzero(np.ones(x.gray.shape, bool))
+    if len(rows) == 0:
+        return np.zeros((0, 3)), np.zeros(0)
+    few = np.random.default_rng(seed).permutation(len(rows))[: 4 * SAMPLES]
+    rows, columns = rows[few], columns[few]
+    d = np.stack([(columns + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(rows))], 1) @ c.world_from_camera[:3, :3].T
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    to = c.centre - sphere.centre
+    b, q = d @ to, to @ to - (0.85 * sphere.radius) ** 2
+    root = b * b - q
+    hit = root > 0
+    n = (to + (-b - np.sqrt(np.maximum(root, 0)))[:, None] * d) / (0.85 * sphere.radius)
+    keep = np.nonzero(hit)[0][:SAMPLES]
+    return n[keep], x.gray[rows[keep], columns[keep]]
+
+
+def _cell(n: np.ndarray) -> np.ndarray:
+    rows = np.minimum((np.arccos(np.clip(n[:, 1], -1, 1)) / np.pi * CELLS[0]).astype(int), CELLS[0] - 1)
+    columns = np.minimum(((np.arctan2(n[:, 0], n[:, 2]) / (2 * np.pi) + 0.5) * CELLS[1]).astype(int), CELLS[1] - 1)
+    return rows * CELLS[1] + columns

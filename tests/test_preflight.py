@@ -1,0 +1,203 @@
+"""The preflight: what it measures on photos whose light, cameras and blur are known."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from relit import cli
+from relit.cameras.se3 import look_at
+from relit.conventions import srgb_from_linear, world_from_gl_camera
+from relit.preflight import inspect
+from relit.preflight.cameras import fundamental, match, widest_gap
+from relit.preflight.drift import drift
+from relit.preflight.light import light_regime, shading_fits
+from relit.preflight.look import Exif, look_at_photos, read_exif, sharpness
+from relit.scene import Camera, Capture, Photo, Pixels, Sphere
+
+SIDE, FOCAL = 96, 130.0
+BALL = Sphere(np.zeros(3), 1.0)
+
+
+def eye(i, n):
+    return np.array([4 * np.sin(2 * np.pi * i / n), 1.0 + 0.4 * (i % 2), 4 * np.cos(2 * np.pi * i / n)])
+
+
+def pattern(p):
+    """(..., 3) points of the ball -> (..., 3) reflectance with much texture."""
+    return 0.45 + 0.35 * np.sign(np.sin(9 * p) * np.sin(7 * p[..., ::-1] + 1))
+
+
+def ball_photo(camera, light, surroundings=(0.2, 0.25, 0.3), mask=True):
+    """A Lambertian ball of radius .85 with the texture `pattern` under light(n, camera) -> (..., 1 or 3), before a plain backdrop."""
+    h, w = camera.height, camera.width
+    v, u = np.mgrid[:h, :w] + 0.5
+    d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.world_from_camera[:3, :3].T
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    o = camera.centre
+    b, q = d @ o, o @ o - 0.85**2
+    hit = b * b > q
+    n = (o + (-b - np.sqrt(np.maximum(b * b - q, 0)))[..., None] * d) / 0.85
+    rgb = np.where(hit[..., None], pattern(n) * light(n, camera), np.array(surroundings)).astype(np.float32)
+    return Pixels(rgb, hit.astype(np.float32) if mask else None)
+
+
+def cameras(n=12, same=False):
+    aims = np.random.default_rng(5).normal(size=(n, 3)) * 0.35 * (not same)
+    return [Camera(SIDE, SIDE, FOCAL, FOCAL, SIDE / 2, SIDE / 2, look_at(eye(0 if same else i, n), a)) for i, a in enumerate(aims)]
+
+
+def capture(tmp_path, lights, surroundings=None, same=False, with_cameras=True, mask=True):
+    """lights: one function per photo."""
+    photos = []
+    for i, (camera, light) in enumerate(zip(cameras(len(lights), same), lights, strict=True)):
+        around = (0.2, 0.25, 0.3) if surroundings is None else surroundings[i]
+        pixels = ball_photo(camera, light, around, mask)
+        photos.append(Photo(f"{i}.png", lambda p=pixels: p, SIDE, SIDE, camera if with_cameras else None))
+    return Capture(tmp_path, "photos", tuple(photos), sphere=BALL if with_cameras else None)
+
+
+def fixed(n, camera):
+    return 0.3 + 0.6 * np.clip(n @ [0.6, 0.7, 0.39], 0, None)[..., None]
+
+
+def flash(n, camera):
+    return np.clip(n @ (camera.centre / np.linalg.norm(camera.centre)), 0, None)[..., None]
+
+
+def sun(seed):
+    rng = np.random.default_rng(seed)
+    towards = rng.normal(size=3)
+    towards /= np.linalg.norm(towards)
+    tint = rng.uniform(0.3, 1, 3)
+    return lambda n, camera: tint * (0.1 + np.clip(n @ towards, 0, None)[..., None])
+
+
+def test_light_regimes(tmp_path):
+    assert light_regime(capture(tmp_path, [fixed] * 12))["guess"] == "fixed"
+    dark = light_regime(capture(tmp_path, [flash] * 12, [(0.002, 0.002, 0.002)] * 12))
+    assert dark["guess"] == "flash" and dark["confidence"] > 0.5 and any("moves with it" in e for e in dark["evidence"])
+    colours = np.random.default_rng(3).uniform(0.02, 0.8, (12, 3))
+    varied = light_regime(capture(tmp_path, [sun(i) for i in range(12)], colours))
+    assert varied["guess"] == "varied"
+    moving = light_regime(capture(tmp_path, [sun(i) for i in range(6)], same=True))
+    assert moving["guess"] == "moving light" and any("one place" in e for e in moving["evidence"])
+    assert light_regime(capture(tmp_path, [fixed] * 6, same=True))["guess"] == "fixed"  # a tripod alone is no moving lamp
+
+
+def test_light_regimes_without_cameras(tmp_path):
+    assert light_regime(capture(tmp_path, [fixed] * 8, with_cameras=False))["guess"] == "fixed"
+    assert light_regime(capture(tmp_path, [flash] * 8, [(0.002,) * 3] * 8, with_cameras=False))["guess"] == "flash"
+    moving = light_regime(capture(tmp_path, [sun(i) for i in range(6)], same=True, with_cameras=False, mask=False))
+    assert moving["guess"] == "moving light"
+
+
+def test_shading_is_told_from_texture(tmp_path):
+    spread, camera, _, facing = shading_fits(look_at_photos(capture(tmp_path, [flash] * 12)), BALL)
+    assert spread > 0.2 and camera > 0.6 and facing > 0.5
+    _, camera, photo, _ = shading_fits(look_at_photos(capture(tmp_path, [sun(i) for i in range(12)])), BALL)
+    assert photo > 0.5 and camera < 0.35
+    spread, _, _, _ = shading_fits(look_at_photos(capture(tmp_path, [fixed] * 12)), BALL)
+    assert spread < 0.2
+    assert shading_fits(look_at_photos(capture(tmp_path, [fixed] * 2)), BALL) is None
+
+
+def test_blur_exposure_and_tint_are_found(tmp_path):
+    def changed(i, pixels):
+        rgb = pixels.rgb
+        rgb = cv2.GaussianBlur(rgb, (0, 0), 2.5) if i == 3 else rgb
+        rgb = rgb * 4 if i == 5 else rgb
+        return Pixels(rgb * [1.5, 1, 1] if i == 7 else rgb, pixels.mask)
+
+    c = capture(tmp_path, [fixed] * 9)
+    photos = [Photo(p.name, lambda p=p, i=i: changed(i, p.load()), SIDE, SIDE, p.camera) for i, p in enumerate(c.photos)]
+    found = drift(look_at_photos(Capture(tmp_path, "photos", tuple(photos))))
+    assert found["blurred"] == ["3.png"]
+    rows = {r["name"]: r for r in found["photos"]}
+    assert rows["5.png"]["ev"] == pytest.approx(2 + rows["4.png"]["ev"], abs=0.5)
+    assert rows["7.png"]["red"] == pytest.approx(np.log2(1.5), abs=0.2) and abs(rows["7.png"]["blue"]) < 0.2
+    assert found["exif_exposure_spread"] is None and found["cameras"] == []
+
+
+def test_sharpness_is_of_the_photo_not_of_what_it_shows():
+    rng = np.random.default_rng(0)
+    noise = cv2.GaussianBlur(rng.random((120, 120, 3)).astype(np.float32), (0, 0), 0.8)
+    faint = 0.5 + 0.1 * (noise - 0.5)
+    assert sharpness(faint, None) == pytest.approx(sharpness(noise, None), rel=0.1)
+    assert sharpness(cv2.GaussianBlur(noise, (0, 0), 2), None) < 0.5 * sharpness(noise, None)
+
+
+def test_exif_is_read_and_damage_is_survived(tmp_path):
+    image, exif = Image.new("RGB", (32, 32), (90, 90, 90)), Image.Exif()
+    exif[0x010F], exif[0x0110] = "Maker", "Model 1"
+    exif.get_ifd(0x8769).update({0x829A: 0.01, 0x829D: 4.0, 0x8827: 400, 0x9209: 1})
+    image.save(tmp_path / "a.jpg", exif=exif)
+    found = read_exif(tmp_path / "a.jpg")
+    assert found.camera == "Maker Model 1" and found.flash is True and found.ev == pytest.approx(np.log2(0.01 * 400 / 16))
+    data = bytearray((tmp_path / "a.jpg").read_bytes())
+    at = data.index(b"Exif") + 14
+    data[at : at + 40] = b"\xff" * 40
+    (tmp_path / "b.jpg").write_bytes(data)
+    assert isinstance(read_exif(tmp_path / "b.jpg"), Exif)
+    assert read_exif(tmp_path / "nowhere.jpg") == Exif()
+
+
+def test_epipolar_distances():
+    a, b = cameras(36)[:2]
+    points = np.random.default_rng(0).normal(size=(30, 3)) * 0.5
+    p, q = (np.concatenate([c.project(points)[:, :2], np.ones((30, 1))], 1) for c in (a, b))
+    assert np.abs(np.einsum("ni,ij,nj->n", q, fundamental(a, b), p)).max() < 1e-9
+
+
+def write(folder, n=24, turned=0.0, side=256):
+    """A folder with transforms.json whose poses are `turned` (radians, about the camera's axis of sight) against the photos."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i in range(n):
+        camera = Camera(side, side, 1.3 * side, 1.3 * side, side / 2, side / 2, look_at(eye(i, n), np.zeros(3)))
+        rgb = ball_photo(camera, fixed).rgb
+        Image.fromarray((np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8)).save(folder / f"images/{i:02d}.png")
+        c, s = np.cos(turned), np.sin(turned)
+        pose = camera.world_from_camera @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+        frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": world_from_gl_camera(pose).tolist()})
+    intrinsics = {"w": side, "h": side, "fl_x": 1.3 * side, "fl_y": 1.3 * side, "cx": side / 2, "cy": side / 2}
+    (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+    return folder
+
+
+def test_cameras_that_do_not_belong_to_the_photos(tmp_path):
+    from relit.plan import Job
+
+    right = inspect(write(tmp_path / "right"), Job(masks="none"))
+    assert right["epipolar"]["share"] > 0.9 and right["epipolar"]["median"] < 0.5
+    assert not [w for w in right["warnings"] if "epipolar" in w["what"]]
+    wrong = inspect(write(tmp_path / "wrong", turned=0.6), Job(masks="none"))
+    assert wrong["epipolar"]["share"] < 0.5 and [w for w in wrong["warnings"] if "epipolar" in w["what"]]
+
+
+def test_photos_without_texture_are_not_matched(tmp_path):
+    looks = look_at_photos(capture(tmp_path, [lambda n, c: np.full((*n.shape[:-1], 1), 0.5)] * 4, mask=False))
+    flat = [type(x)(**{**x.__dict__, "rgb": np.full_like(x.rgb, 0.3)}) for x in looks]
+    assert match(flat[0], flat[1]) is None
+
+
+def test_widest_gap():
+    ring = np.array([[np.cos(a), 0, np.sin(a)] for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)])
+    assert widest_gap(ring) == pytest.approx(90, abs=5)  # nobody looked from above
+    assert widest_gap(ring[:6] + [0, 0.5, 0]) > 60
+
+
+def test_the_page(tmp_path, capsys):
+    folder = write(tmp_path / "photos & <co>", n=6, side=128)
+    assert cli.main(["inspect", str(folder), "--html", str(tmp_path / "p.html"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    page = (tmp_path / "p.html").read_text()
+    assert "<co>" not in page and "&lt;co&gt;" in page
+    assert "<script" not in page and "http" not in page.replace("http://www.w3.org/2000/svg", "")
+    assert page.count("<figure>") >= 6 and "<svg" in page and found["light_regime"]["guess"] in page
+    assert found["looked_at"] == 6 and len(found["drift"]["photos"]) == 6 and found["coverage"]["fill"] > 0.3
+    assert cli.main(["inspect", str(folder), "--html", str(tmp_path / "p.html")]) == 3  # nothing is overwritten
