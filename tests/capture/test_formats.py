@@ -278,3 +278,27 @@ def test_numbers_of_cameras_and_photos_must_agree(tmp_path, cameras):
     np.savez(tmp_path / "cameras.npz", **{f"world_mat_{i}": shots.projection(c) for i, c in enumerate(cameras)})
     with pytest.raises(UserError, match="6 cameras and 5 photos do not match"):
         open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".exr"])
+def test_normal_priors_know_where_they_know_nothing(tmp_path, suffix):
+    """Black and middle grey of a picture and zeros of an EXR are no normals; the others come back unit, resized or not."""
+    from relit.capture.photo import read_normal
+    from relit.images import write_data, write_linear
+
+    normal = np.zeros((12, 16, 3), np.float32)
+    normal[:, :8] = [0.6, 0.0, -0.8]
+    normal[:6, 8:] = [0.0, -0.6, -0.8]
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".exr":
+        write_linear(path, normal * 1.7)  # of any length
+    else:
+        codes = normal * 0.5 + 0.5  # unknown is middle grey ...
+        codes[9:, 8:] = 0  # ... or black
+        write_data(path, codes)
+    got = read_normal(path, (12, 16))
+    np.testing.assert_allclose(got, normal, atol=0.01)
+    assert (got[6:, 8:] == 0).all()
+    small = read_normal(path, (6, 8))
+    np.testing.assert_allclose(small[:, :4], normal[::2, :8:2], atol=0.01)
+    assert (small[3:, 4:] == 0).all()

@@ -195,14 +195,21 @@ def upright_mask(mask: np.ndarray, shape: tuple[int, int], orientation: int) -> 
 
 
 def read_normal(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) unit normals in OpenCV camera axes: a picture maps [-1, 1] to [0, 1], an EXR holds them as they are."""
+    """(H, W, 3) unit normals in OpenCV camera axes, 0 where unknown: a picture maps [-1, 1] to [0, 1], an EXR holds them as they are.
+
+    Unknown is what is far from unit length: black and middle grey of a picture, zero of an EXR.
+    """
     data = read_data(path)
     if data.ndim != 3 or data.shape[2] < 3:
         raise UserError("a normal prior has no three channels", fix=f"write x, y, z as red, green, blue: {path}")
-    normal = data[..., :3] if path.suffix.lower() == ".exr" else data[..., :3] * 2 - 1
+    picture = path.suffix.lower() != ".exr"
+    normal = data[..., :3] * 2 - 1 if picture else data[..., :3]
+    length = np.linalg.norm(normal, axis=-1)
+    known = (length > 0.5) & (length < 1.5) if picture else length > 0.1
+    normal = _unit_normals(normal) * known[..., None]
     if normal.shape[:2] != shape:
-        normal = cv2.resize(np.ascontiguousarray(normal), shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return _unit_normals(normal)
+        normal = _unit_normals(cv2.resize(np.ascontiguousarray(normal), shape[::-1], interpolation=cv2.INTER_LINEAR))
+    return normal.astype(np.float32)
 
 
 def _unit_normals(normal: np.ndarray) -> np.ndarray:
