@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import struct
+import warnings
 from pathlib import Path
 from urllib.parse import unquote
 
 import cv2
 import numpy as np
+from PIL import Image as PilImage
 
 from relit.asset.parts import Part, merge_parts
 from relit.conventions import linear_from_srgb
@@ -17,9 +20,23 @@ from relit.errors import UserError
 from relit.scene import Material, Mesh
 
 MAX_BYTES = 2 << 30
+MAX_TEXELS = 128_000_000  # of one texture
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 UNDERSTOOD = {"KHR_materials_ior", "KHR_materials_specular", "KHR_texture_transform", "KHR_mesh_quantization"}
+
+
+def _size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) that a picture claims, before it is decoded; None for what is no picture."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PilImage.open(io.BytesIO(data)) as image:
+                return image.size
+    except PilImage.DecompressionBombError:
+        return 1 << 20, 1 << 20
+    except (OSError, ValueError, SyntaxError, struct.error):
+        return None
 
 
 class _File:
@@ -60,9 +77,11 @@ class _File:
     def resource(self, uri: str) -> bytes:
         if uri.startswith("data:"):
             return base64.b64decode(uri.split(",", 1)[1])
-        file = self.path.parent / unquote(uri)
+        file = inside(self.path.parent, unquote(uri))
         if not file.is_file():
             raise UserError("a file that the model refers to is missing", fix=f"put it beside the model: {file}")
+        if file.stat().st_size > MAX_BYTES:
+            raise UserError("a file that the model refers to is larger than 2 GB", fix=f"make it smaller: {file}")
         return file.read_bytes()
 
     def view(self, index: int) -> tuple[bytes, int]:
@@ -109,8 +128,20 @@ class _File:
         return self.images[index]
 
 
+def inside(folder: Path, name: str) -> Path:
+    """The file `name` in `folder` or below. Raises UserError for one that lies elsewhere: a model must not read the user's other files."""
+    file = folder / name
+    if "\0" in name or not file.resolve().is_relative_to(folder.resolve()):
+        raise UserError("the model refers to a file outside its folder", "such files are not read", f"put it beside the model: {file}")
+    return file
+
+
 def decode_image(data: bytes, name: str) -> np.ndarray:
     """PNG or JPEG bytes -> (H, W, C) float32 in [0, 1], channels in RGB order, no transfer curve removed."""
+    size = _size(data)
+    if size is not None and size[0] * size[1] > MAX_TEXELS:
+        what = f"a texture of {size[0]} x {size[1]} pixels is too large"
+        raise UserError(what, f"at most {MAX_TEXELS // 10**6} million pixels are read", f"make it smaller: {name}")
     a = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if a is None:
         raise UserError("a texture cannot be decoded", "it is neither PNG nor JPEG, or it is damaged", f"export it again: {name}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.asset.gltf_read import decode_image
+from relit.asset.gltf_read import decode_image, inside
 from relit.asset.parts import Part, merge_parts
 from relit.conventions import linear_from_srgb
 from relit.errors import UserError
@@ -101,9 +101,9 @@ def _read_mtl(path: Path) -> dict[str, Material]:
 
 def _map(path: Path, words: list[str]) -> np.ndarray:
     """The image that a map_* entry names; options (-s 1 1 1 and the like) come before the file name."""
-    file = path.parent / words[-1]
+    file = inside(path.parent, words[-1] if words else "")
     if not file.is_file():
-        file = path.parent / " ".join(words)
+        file = inside(path.parent, " ".join(words))
     if not file.is_file():
         raise UserError("a texture that the material library names is missing", fix=f"put it beside the OBJ: {file}")
     image = decode_image(file.read_bytes(), str(file))
