@@ -199,3 +199,64 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 def test_encoders():
     assert images.encode_jpeg(RAMP)[:2] == b"\xff\xd8" and images.encode_png(RAMP)[:4] == b"\x89PNG"
+
+
+# ---------------------------------------------------------------- colour profiles
+
+P3_TO_XYZ = np.array([[0.51512, 0.29198, 0.15710], [0.24120, 0.69225, 0.06657], [-0.00105, 0.04189, 0.78407]])  # adapted to D50
+SRGB_TO_XYZ = np.array([[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]])
+GAMMA = 2.19921875  # a curve of one number in an ICC profile: unsigned 8.8
+
+
+def p3_profile(name=b"Display P3") -> bytes:
+    """A version 2 matrix profile (ICC.1:2001-04) with Display P3's primaries and a plain gamma."""
+    import struct
+
+    def xyz(v):
+        return b"XYZ " + bytes(4) + b"".join(struct.pack(">i", round(float(x) * 65536)) for x in v)
+
+    text = b"desc" + bytes(4) + struct.pack(">I", len(name) + 1) + name + bytes(1 + 4 + 4 + 2 + 1 + 67)
+    curve = b"curv" + bytes(4) + struct.pack(">IH", 1, round(GAMMA * 256)) + bytes(2)
+    tags = {b"desc": text + bytes(-len(text) % 4), b"wtpt": xyz([0.9642, 1.0, 0.8249]), b"cprt": b"text" + bytes(4) + b"none" + bytes(4)}
+    for k, c in enumerate((b"r", b"g", b"b")):
+        tags[c + b"XYZ"], tags[c + b"TRC"] = xyz(P3_TO_XYZ[:, k]), curve
+    table, body, at = b"", b"", 128 + 4 + 12 * len(tags)
+    for tag, data in tags.items():
+        table += tag + struct.pack(">II", at + len(body), len(data))
+        body += data
+    head = struct.pack(">I4sI4s4s4s", at + len(body), b"none", 0x02400000, b"mntr", b"RGB ", b"XYZ ")
+    head += struct.pack(">6H", 2026, 1, 1, 0, 0, 0) + b"acsp" + bytes(28) + xyz([0.9642, 1.0, 0.8249])[8:]
+    return head.ljust(128, bytes(1)) + struct.pack(">I", len(tags)) + table + body
+
+
+@pytest.mark.parametrize("mode, suffix", [("RGB", ".png"), ("RGBA", ".png"), ("RGB", ".jpg")])
+def test_display_p3_photos_are_carried_to_srgb(tmp_path, mode, suffix):
+    from PIL import Image
+
+    from relit.images.read import read_small
+
+    codes = np.array([180, 90, 60, 200][: len(mode)], np.uint8)
+    picture = Image.fromarray(np.broadcast_to(codes, (16, 16, len(mode))).copy())
+    path = tmp_path / f"a{suffix}"
+    picture.save(path, icc_profile=p3_profile(), **({"quality": 100, "subsampling": 0} if suffix == ".jpg" else {}))
+    linear = (codes[:3] / 255.0) ** GAMMA
+    expected = np.linalg.inv(SRGB_TO_XYZ) @ P3_TO_XYZ @ linear
+    alpha = codes[3] / 255 if mode == "RGBA" else 1.0
+    got = images.read_image(path)
+    np.testing.assert_allclose(got.rgb[8, 8], expected * alpha, atol=0.01)
+    assert np.abs(expected - linear).max() > 0.03  # the profile matters
+    np.testing.assert_allclose(read_small(path, 8).rgb[4, 4], expected, atol=0.01)
+    np.testing.assert_allclose(images.read_data(path)[8, 8] * 255, codes, atol=1.01)  # data has no colour
+    if mode == "RGBA":
+        np.testing.assert_allclose(got.alpha, 200 / 255, atol=1e-6)
+
+
+def test_srgb_and_broken_profiles_change_nothing(tmp_path):
+    from PIL import Image
+
+    picture = Image.fromarray(np.full((8, 8, 3), (180, 90, 60), np.uint8))
+    picture.save(tmp_path / "plain.png")
+    plain = images.read_image(tmp_path / "plain.png").rgb
+    for k, profile in enumerate((p3_profile(b"sRGB IEC61966-2.1"), b"no profile at all" * 20)):
+        picture.save(tmp_path / f"{k}.png", icc_profile=profile)
+        np.testing.assert_array_equal(images.read_image(tmp_path / f"{k}.png").rgb, plain)

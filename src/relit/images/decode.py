@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import warnings
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image as PilImage
-from PIL import ImageOps, UnidentifiedImageError
+from PIL import ImageCms, ImageOps, UnidentifiedImageError
 
 from relit.errors import UserError
 
@@ -41,8 +42,8 @@ def _too_large(path: Path, width: int, height: int) -> None:
         )
 
 
-def decode(path: Path, upright: bool = True) -> tuple[np.ndarray, bool]:
-    """-> ((H, W[, C]) uint8, uint16 or float32 array, True when it is linear already)."""
+def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.ndarray, bool]:
+    """-> ((H, W[, C]) uint8, uint16 or float32 array, True when it is linear already). colours: apply the file's colour profile."""
     suffix = checked(path)
     if suffix == ".exr":
         return _finite(exr(path)[0], path), True
@@ -67,12 +68,31 @@ def decode(path: Path, upright: bool = True) -> tuple[np.ndarray, bool]:
                 image = image.convert("RGBA")
             elif image.mode in ("1", "CMYK", "YCbCr", "HSV", "LAB"):
                 image = image.convert("L" if image.mode == "1" else "RGB")
-            array = np.array(image)
+            array = np.array(standard_colours(image) if colours else image)
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
     if array.dtype == np.int32:  # PIL's mode I: 16-bit grey
         array = np.clip(array, 0, 65535).astype(np.uint16)
     return array, False
+
+
+def standard_colours(image: PilImage.Image) -> PilImage.Image:
+    """An 8-bit RGB(A) picture with a colour profile other than sRGB (phones write Display P3) in sRGB codes, clipped to their range."""
+    profile = image.info.get("icc_profile")
+    if not profile or image.mode not in ("RGB", "RGBA"):
+        return image
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in (source.profile.profile_description or ""):
+            return image
+        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB", intent)
+        out = ImageCms.applyTransform(image.convert("RGB"), transform)
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return image  # a broken profile is no reason to refuse the photo
+    if image.mode == "RGBA":
+        out.putalpha(image.getchannel("A"))
+    return out
 
 
 def _is_sixteen_bit(path: Path, suffix: str) -> bool:

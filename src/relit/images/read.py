@@ -13,7 +13,7 @@ from PIL import ImageOps
 
 from relit.conventions import linear_from_srgb
 from relit.errors import UserError
-from relit.images.decode import FLOAT, RAW, broken, checked, decode, exr, hdr_size, pil, raw_file
+from relit.images.decode import FLOAT, RAW, broken, checked, decode, exr, hdr_size, pil, raw_file, standard_colours
 from relit.images.write import codes_of
 
 FULL_FRAME_DIAGONAL = 43.2666  # mm, of the 36 x 24 mm film that "35 mm equivalent" focal lengths refer to
@@ -54,7 +54,8 @@ class Header:
 def read_image(path: str | Path, upright: bool = True) -> Image:
     """Decode a photo to linear float32, EXIF orientation applied once (or not at all with upright=False).
 
-    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed), EXR and HDR (linear already), HEIC and RAW with the optional extras.
+    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed; 8-bit files with another colour profile are carried to sRGB before), EXR and HDR
+    (linear already), HEIC and RAW with the optional extras.
     Raises UserError for a missing, truncated, oversized or unknown file and for NaN or infinite pixels.
     """
     path = Path(path)
@@ -99,7 +100,7 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
             small = image.convert("RGBA" if has_alpha else "RGB")
             small = ImageOps.exif_transpose(small) if upright else small
             small = small.reduce(max(1, max(small.size) // side)) if max(small.size) >= 2 * side else small
-            array = _unit(np.array(small))
+            array = _unit(np.array(standard_colours(small)))
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
     return Image(linear_from_srgb(array[..., :3]), array[..., 3] if has_alpha else None)
@@ -107,7 +108,7 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
 
 def read_data(path: str | Path) -> np.ndarray:
     """Decode without a transfer curve: (H, W) or (H, W, C) float32; 8/16-bit codes divided by their largest value. No alpha handling."""
-    array, _ = decode(Path(path))
+    array, _ = decode(Path(path), colours=False)
     array = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
     return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
 
