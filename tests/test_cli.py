@@ -78,6 +78,8 @@ def test_every_verb_has_help_with_common_flags_first(capsys, verb):
         (["synthesize", "multview", "--asset", "a", "--light", "b", "-o", "c"], "Did you mean 'multiview'?"),
         (["export", "x", "-o", "y.stl"], "cannot be told from the ending"),
         (["evaluate", "x"], "missing: --truth"),
+        (["relight", "x", "--light", "l.hdr", "-o", "y", "--albedo-scale", "1,2"], "'1,2' is not one number or R,G,B"),
+        (["relight", "x", "--light", "l.hdr", "-o", "y", "--albedo-scale", "0"], "each above 0"),
     ],
 )
 def test_wrong_usage_is_exit_code_2(capsys, tmp_path, monkeypatch, argv, said):
@@ -95,6 +97,26 @@ def test_flags_stand_in_any_order_and_values_may_be_negative(tmp_path):
     assert (str(args.input), str(args.out), args.quality) == ("photos", "run", "draft")
     assert args.sphere == (-1.0, 0.5, 0.0, 2.0) and args.pairs == ["a=1", "b=2"]
     assert verbs.parser_for("reconstruct").parse(["photos", "-o", "run"]).quality is None
+
+
+def test_each_kind_of_capture_has_its_own_flags(capsys, monkeypatch, tmp_path):
+    """The kind is the first positional, wherever it stands; another kind's flags are unknown to it."""
+    from relit.verbs.parser import Kind
+    from relit.verbs.synthesizers import SYNTHESIZERS
+
+    seen = []
+    flags = lambda parser: parser.common.add_argument("--count", type=int, default=10)  # noqa: E731
+    monkeypatch.setitem(SYNTHESIZERS, "duplicates", Kind(flags, lambda args: seen.append((args.kind, args.count, args.asset.name))))
+    common = ["--asset", "a.glb", "-o", str(tmp_path / "out")]
+    assert run(capsys, "synthesize", "duplicates", *common, "--count", "6")[0] == 0
+    assert run(capsys, "synthesize", *common, "--count=7", "duplicates")[0] == 0
+    assert seen == [("duplicates", 6, "a.glb"), ("duplicates", 7, "a.glb")]
+    code, _, err = run(capsys, "synthesize", "duplicates", *common, "--views", "6")
+    assert code == 2 and "unknown flag '--views'" in err
+    code, _, err = run(capsys, "synthesize", "multiview", *common, "--light", "l.hdr", "--count", "6")
+    assert code == 2 and "unknown flag '--count'" in err
+    assert "--count" in run(capsys, "synthesize", "duplicates", "--help")[1]
+    assert "--views" in run(capsys, "synthesize", "--help")[1]
 
 
 def stub(monkeypatch, act):
