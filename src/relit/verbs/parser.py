@@ -35,8 +35,10 @@ class Verb:
 
     def kind_in(self, argv: Sequence[str]) -> str:
         """The kind that the words after the verb name: the first of them that is one and does not follow a flag; else the first kind."""
-        named = [w for before, w in zip(("", *argv), argv, strict=False) if w in self.kinds and not before.startswith("-")]
-        return next(iter(named), next(iter(self.kinds)))
+        for before, word in zip(("", *argv), argv, strict=False):
+            if word in self.kinds and (not before.startswith("-") or "=" in before):
+                return word
+        return next(iter(self.kinds))
 
 
 class Parser(argparse.ArgumentParser):
