@@ -168,6 +168,18 @@ class Material:
 
 
 @dataclass(frozen=True)
+class Flash:
+    """A point light that moves with the camera (PIR Eq. 4): at camera_centre + world_from_camera offset.
+
+    offset: (3,) in OpenCV camera axes, world units. intensity: (3,) radiant intensity I, so that a white Lambertian surface facing the light
+    at distance d shows radiance I / (pi d^2) in linear pixels.
+    """
+
+    offset: np.ndarray
+    intensity: np.ndarray
+
+
+@dataclass(frozen=True)
 class Asset:
     """A relightable object: what `RUN/asset` holds.
 
@@ -175,6 +187,7 @@ class Asset:
     world_from_asset: (4, 4) similarity from the asset frame to the frame of `cameras` and `environment`.
     environment: (H, W, 3) float32 lat-long radiance in the world frame (Mitsuba's axes), or None.
     cameras: (name, Camera) pairs in the world frame. meta: what goes to asset.json besides.
+    flash: the light at the cameras of a flash capture, or None.
     """
 
     mesh: Mesh
@@ -183,3 +196,4 @@ class Asset:
     environment: np.ndarray | None = None
     cameras: tuple[tuple[str, Camera], ...] = ()
     meta: dict = field(default_factory=dict)
+    flash: Flash | None = None
