@@ -161,7 +161,7 @@ def test_every_ablation_changes_the_result(capture_folder, tmp_path, monkeypatch
     seen = {"blocked": 0.0}
     options = replace(TINY, level_steps=(4, 4), surface_steps=3)
     if without == "hull":
-        options = replace(options, level_steps=(0, 0))
+        options = replace(options, levels=(32,), level_steps=(0,))
     else:
         options = replace(options, without=(without,))
     found = multiview.surface_options(options)

@@ -81,7 +81,7 @@ MULTIVIEW = Suite(
     },
     draft_bars={"seconds": ("<=", 90.0), "peak_memory": ("<=", 4.0)},
     ablations={
-        "hull": ("level_steps=0,0,0",),  # the shape is the visual hull of the masks
+        "hull": ("levels=128", "level_steps=0"),  # the shape is the visual hull of the masks
         "interreflection": ("without=interreflection",),
         "exchange": ("without=exchange",),
         "material_prior": ("without=material_prior",),
