@@ -33,13 +33,13 @@ def lump() -> tuple[Mesh, Material]:
     return replace(mesh, normals=vertex_normals(mesh)), Material(base, np.full((2, 2), 0.8, np.float32), np.zeros((2, 2), np.float32))
 
 
-def cameras() -> list[Camera]:
+def cameras(size: int = SIZE, views: int = VIEWS) -> list[Camera]:
     """All around, 2.1 from the origin."""
-    out, focal = [], 0.5 * SIZE / np.tan(FIELD / 2)
-    for i in range(VIEWS):
-        y = 1 - 2 * (i + 0.5) / VIEWS
+    out, focal = [], 0.5 * size / np.tan(FIELD / 2)
+    for i in range(views):
+        y = 1 - 2 * (i + 0.5) / views
         o = 2.1 * np.array([np.sqrt(1 - y * y) * np.cos(2.4 * i), y, np.sqrt(1 - y * y) * np.sin(2.4 * i)])
-        out.append(Camera(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2, look_at(o)))
+        out.append(Camera(size, size, focal, focal, size / 2, size / 2, look_at(o)))
     return out
 
 
