@@ -302,3 +302,15 @@ def test_normal_priors_know_where_they_know_nothing(tmp_path, suffix):
     small = read_normal(path, (6, 8))
     np.testing.assert_allclose(small[:, :4], normal[::2, :8:2], atol=0.01)
     assert (small[3:, 4:] == 0).all()
+
+
+def test_raw_files_beside_their_developed_photos_are_left_out(tmp_path):
+    from relit.images import write_srgb
+
+    picture = np.random.default_rng(0).uniform(0, 1, (20, 30, 3)).astype(np.float32)
+    for k in range(4):
+        write_srgb(tmp_path / f"DSC{k}.jpg", picture)
+        (tmp_path / f"DSC{k}.NEF").write_bytes(b"never opened")
+    capture = open_capture(tmp_path, masks="none")
+    assert [p.name for p in capture.photos] == [f"DSC{k}.jpg" for k in range(4)]
+    assert any("4 RAW files" in note for note in capture.notes)

@@ -13,7 +13,7 @@ import numpy as np
 from relit.cameras.pinhole import Lens, lens_of, undistorted_camera, undistortion_map
 from relit.capture.frames import Frame, Reading, image_folder, list_images
 from relit.errors import UserError
-from relit.images import EXTENSIONS, Header, read_data, read_header, read_image, turn_upright
+from relit.images import EXTENSIONS, RAW, Header, read_data, read_header, read_image, turn_upright
 from relit.masks.files import read_mask
 from relit.masks.threshold import Backdrop
 from relit.scene import Camera, Photo, Pixels
@@ -227,8 +227,13 @@ def recognise(path: Path) -> Path | None:
 
 
 def read(path: Path, found: Path) -> Reading:
-    """All photos of a folder, without cameras."""
-    return Reading("photos", path, tuple(Frame(f, f.relative_to(path).as_posix()) for f in list_images(found)))
+    """All photos of a folder, without cameras. Of a camera that writes two files of every photo the developed one is taken."""
+    files = list_images(found)
+    developed = {f.stem for f in files if f.suffix.lower() not in RAW}
+    kept = [f for f in files if f.suffix.lower() not in RAW or f.stem not in developed]
+    twins = len(files) - len(kept)
+    notes = (f"{twins} RAW files lie beside a developed photo of the same name and are left out",) if twins else ()
+    return Reading("photos", path, tuple(Frame(f, f.relative_to(path).as_posix()) for f in kept), notes=notes)
 
 
 def headers_of(frames: tuple[Frame, ...]) -> list[Header]:
