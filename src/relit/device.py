@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import glob
 import os
+import signal
+import threading
 from pathlib import Path
 
 from relit.errors import EXIT_ENVIRONMENT, UserError
@@ -56,3 +58,13 @@ def use_device(device: str = "auto") -> str:
     mi.set_variant(VARIANTS[chosen])
     mi.set_log_level(mi.LogLevel.Error)
     return chosen
+
+
+def load_pycolmap():
+    """pycolmap, with SIGTERM's handler as it was: its import installs glog's, which ends the process with a stack trace."""
+    before = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    if threading.current_thread() is threading.main_thread() and before is not None:
+        signal.signal(signal.SIGTERM, before)
+    return pycolmap

@@ -62,7 +62,10 @@ def reconstruct(
         if not getattr(recipe, "FINDS_CAMERAS", False):
             capture = with_cameras(capture, run, job)
         if not finished:
-            _save(run, recipe.reconstruct(capture, run, options, job.seed), capture, kind, job, chosen)
+            asset = recipe.reconstruct(capture, run, options, job.seed)
+            unchanged(run, capture)
+            _save(run, asset, capture, kind, job, chosen)
+        if not (run.folder / "photos" / "index.json").is_file():
             from relit.viewer.photos import write_photos
 
             write_photos(run.folder, capture)  # for `relit view`
@@ -73,6 +76,18 @@ def reconstruct(
                 write_report(run.folder, capture)
             run.say(f"report: {run.folder / 'report.html'}")
         return asset_folder
+
+
+def unchanged(run: Run, capture: Capture) -> None:
+    """Raises UserError when an input file is not what it was when the run was begun: stages read the photos anew."""
+    before, now = json.loads((run.folder / "inputs.json").read_text()), input_digests(capture)
+    changed = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    if changed:
+        raise UserError(
+            f"{len(changed)} input files changed while the run was at work: {', '.join(changed[:5])}",
+            "the asset would mix the old and the new",
+            f"put the old files back and give the same command again, or --overwrite to begin anew: {run.folder}",
+        )
 
 
 def apart(input: Path, out: Path) -> None:

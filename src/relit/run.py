@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.errors import EXIT_USAGE, UserError
+from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError
 from relit.files import disk_errors, load_arrays, parse_toml, read_json, save_arrays, toml_text, write_text
 from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_seconds
 
@@ -60,7 +60,11 @@ class Run:
         wanted = parse_toml(toml_text(config))
         with disk_errors(folder):
             _refuse_foreign(folder)
-            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except (FileNotFoundError, NotADirectoryError, FileExistsError) as error:  # below a file, or in /proc
+                what = f"the output folder cannot be made: {error.strerror}"
+                raise UserError(what, fix=f"choose another -o: {folder}", code=EXIT_ENVIRONMENT) from None
             lock = _lock(folder)
             try:
                 if not resume:

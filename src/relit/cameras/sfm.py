@@ -19,6 +19,7 @@ import numpy as np
 from relit.capture.colmap_model import camera_from_colmap, sparse_points, world_from_camera
 from relit.capture.photo import with_camera
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
+from relit.device import load_pycolmap
 from relit.errors import EXIT_FAILED, UserError
 from relit.images import write_bytes, write_data, write_srgb
 from relit.scene import Capture, Photo, Sphere
@@ -85,7 +86,7 @@ def find_cameras(
     The frame is COLMAP's (arbitrary, scale as well).
     Raises UserError (exit code 4) when fewer than three photos can be registered.
     """
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     began = time.monotonic()
     photos = list(capture.photos)
@@ -160,7 +161,7 @@ class _Found:
 
 
 def _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_masks) -> _Found:
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     folder = workdir / "tries" / str(number)
     folder.mkdir()
@@ -225,7 +226,7 @@ def _parameters(model: str, f: float, cx: float, cy: float) -> str:
 
 
 def _mapping(settings: Settings, seed: int, threads: int, focal: float | None):
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     o = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, extract_colors=False)
     o.min_model_size, o.min_num_matches, o.max_num_models = 3, FEW_MATCHES, 10
@@ -249,7 +250,7 @@ def _groups(photos: list[Photo], scales: list[float]) -> dict[tuple, list[int]]:
 
 def _features(database: Path) -> dict[str, int]:
     """Number of features per photo."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     with pycolmap.Database.open(database) as db:
         return {i.name: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
@@ -257,7 +258,7 @@ def _features(database: Path) -> dict[str, int]:
 
 def _matches(database: Path) -> dict[str, int]:
     """Per photo, the most verified matches that it shares with one other photo."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     with pycolmap.Database.open(database) as db:
         names = {i.image_id: i.name for i in db.read_all_images()}
@@ -344,7 +345,7 @@ def _keep(workdir: Path, key: list, model, sphere: Sphere, source: str, verdict:
 
 def _kept(workdir: Path, key: list):
     """-> (model, sphere, its source, verdict) of an earlier call with the same photos, or None."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     try:
         record = json.loads((workdir / "found.json").read_text())

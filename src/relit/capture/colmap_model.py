@@ -10,6 +10,7 @@ import numpy as np
 
 from relit.cameras.pinhole import FisheyeLens, Lens
 from relit.capture.frames import IMAGE_FOLDERS, Frame, Reading, inside
+from relit.device import load_pycolmap
 from relit.errors import UserError
 from relit.images import EXTENSIONS
 from relit.scene import Camera
@@ -29,7 +30,7 @@ class ColmapLens:
 
     @cached_property
     def _camera(self):
-        import pycolmap
+        pycolmap = load_pycolmap()
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.parameters))
 
@@ -54,7 +55,7 @@ def recognise(path: Path) -> Path | None:
 
 def read(path: Path, found: Path) -> Reading:
     """Read the largest model."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     models, notes = [], []
     for folder in model_folders(path):

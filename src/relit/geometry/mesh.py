@@ -10,6 +10,7 @@ import trimesh
 from scipy.ndimage import map_coordinates
 from skimage.measure import marching_cubes
 
+from relit.device import load_pycolmap
 from relit.errors import EXIT_FAILED, UserError
 from relit.scene import Mesh
 
@@ -56,7 +57,7 @@ def _without_floaters(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _decimate(mesh: trimesh.Trimesh, ratio: float) -> trimesh.Trimesh:
     """Quadric edge collapse (Garland & Heckbert 1997), by pycolmap; degenerate and doubled faces are removed after it."""
-    import pycolmap
+    pycolmap = load_pycolmap()
 
     pycolmap.logging.minloglevel = 2
     with tempfile.TemporaryDirectory() as folder:

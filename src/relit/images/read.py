@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -68,12 +69,14 @@ def read_image(path: str | Path, upright: bool = True) -> Image:
         array = array[..., :-1]
     if array.dtype.kind == "u":
         clipped = (array == np.iinfo(array.dtype).max).any(axis=-1)
-    rgb = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
-    rgb = np.repeat(rgb, 3, axis=2) if rgb.shape[2] == 1 else rgb[..., :3]
-    if not is_linear:
-        rgb = linear_from_srgb(rgb)
-        if alpha is not None:  # coded formats store straight alpha, EXR premultiplied
-            rgb = rgb * alpha[..., None]
+    array = np.repeat(array, 3, axis=2) if array.shape[2] == 1 else array[..., :3]
+    if array.dtype.kind == "u" and not is_linear:
+        rgb = _code_table(array.dtype.str)[array]  # one look-up instead of a dozen arrays of the photo's size
+    else:
+        rgb = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
+        rgb = rgb if is_linear else linear_from_srgb(rgb)
+    if not is_linear and alpha is not None:  # coded formats store straight alpha, EXR premultiplied
+        rgb *= alpha[..., None]
     return Image(np.ascontiguousarray(rgb), alpha, clipped)
 
 
@@ -160,6 +163,12 @@ def _raw_focal(path: Path, width: int, height: int) -> float | None:
             return _focal(image.getexif(), width, height)
     except UserError:
         return None
+
+
+@lru_cache(maxsize=2)
+def _code_table(dtype: str) -> np.ndarray:
+    """Linear value (float32) of each 8- or 16-bit sRGB code."""
+    return linear_from_srgb(_unit(np.arange(np.iinfo(dtype).max + 1, dtype=dtype)))
 
 
 def _unit(codes: np.ndarray) -> np.ndarray:
