@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+FOG = 0.9  # radius of the fog at the start, unit frame
+
 
 @dataclass
 class Background:
@@ -25,9 +27,15 @@ class Background:
 
 
 def start_background(n: int, level: np.ndarray, samples: int = 24) -> Background:
-    """level: (3,) mean radiance of the photos."""
+    """level: (3,) mean radiance of the photos.
+
+    The object sphere starts as dense fog. Where photos stand all around, each could be explained by a patch of background that no other
+    sees, and an object that starts thin is never found; from fog it is carved, and what the fog hides is found behind it.
+    """
+    x = np.linspace(-2, 2, n, dtype=np.float32) ** 2
+    within = (x[:, None, None] + x[:, None] + x) < FOG**2  # [z, y, x]
     cells = np.empty((n**3, 4), np.float32)
-    cells[:, 0] = -1.0
+    cells[:, 0] = np.where(within.ravel(), 4.0, -1.0)
     cells[:, 1:] = np.log(np.maximum(level, 1e-3))
     return Background(n, mi.Float(cells.ravel()), samples)
 
