@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from relit.asset.asset import save_asset
-from relit.capture.synthetic import look_at
+from relit.cameras.se3 import look_at
 from relit.conventions import move_pose, rotate_environment, sample_environment, similarity, world_from_gl_camera
 from relit.errors import UserError
 from relit.evaluate import photos

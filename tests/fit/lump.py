@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from relit.cameras.se3 import exp_so3
-from relit.capture.synthetic import look_at
+from relit.cameras.se3 import exp_so3, look_at
 from relit.conventions import world_from_gl_camera
 from relit.geometry.tangents import vertex_normals
 from relit.images import write_linear

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.capture.synthetic import look_at
+from relit.cameras.se3 import look_at
 from relit.conventions import environment_directions
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from relit.capture.synthetic import look_at
+from relit.cameras.se3 import look_at
 from relit.fit.pixels import batch_of, corrected, draw_pixels, locate, make_bank, rays_through, sphere_pixels
 from relit.scene import Camera
 

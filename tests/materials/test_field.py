@@ -56,7 +56,7 @@ def test_between_centres_it_is_bilinear(field):
 
 def test_the_renderer_reads_the_pictures_where_the_fit_does(field):
     """A square with uv = position, v = 0 at the top: base colour in the picture against the fit's look-up at the same uv."""
-    from relit.capture.synthetic import look_at
+    from relit.cameras.se3 import look_at
     from relit.rendering.mitsuba_scene import build_scene, render_channels
     from relit.scene import Camera, Material, Mesh
 

@@ -124,16 +124,15 @@ def camera_errors(a_from_camera: np.ndarray, b_from_camera: np.ndarray, robust: 
     return angle, distance
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray = (0.0, 1.0, 0.0)) -> np.ndarray:
-    """(4, 4) world_from_camera, OpenCV axes, at `eye` looking at `target` with `up` upwards in the image."""
+def look_at(eye, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), roll: float = 0.0) -> np.ndarray:
+    """(4, 4) world_from_camera, OpenCV axes, at `eye` looking at `target`, `up` upwards in the image; roll in radians about its axis."""
     eye, up = np.asarray(eye, dtype=np.float64), np.asarray(up, dtype=np.float64)
     z = np.asarray(target, dtype=np.float64) - eye
     z = z / np.linalg.norm(z)
     x = np.cross(z, up)
-    if np.linalg.norm(x) < 1e-8:  # looks along `up`: any other direction will do
-        x = np.cross(z, np.roll(up, 1) + 0.1)
+    if np.linalg.norm(x) < 1e-6:  # looks along `up`: any other direction will do
+        x = np.cross(z, np.roll(up, 1))
     x = x / np.linalg.norm(x)
-    out = np.eye(4)
-    out[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    out[:3, 3] = eye
-    return out
+    y = np.cross(z, x)
+    c, s = np.cos(roll), np.sin(roll)
+    return similarity(np.stack([c * x + s * y, c * y - s * x, z], axis=1), eye)

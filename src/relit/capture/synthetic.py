@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from relit.cameras.se3 import look_at
 from relit.conventions import move_points, similarity, world_from_gl_camera
 from relit.errors import UserError
 from relit.files import write_text
@@ -157,19 +158,6 @@ def object_frame(mesh: Mesh, radius: float = RADIUS) -> np.ndarray:
     if not reach > 0:
         raise UserError("the asset has no extent", "all its vertices coincide")
     return similarity(np.eye(3), -radius / reach * centre, radius / reach)
-
-
-def look_at(centre, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), roll: float = 0.0) -> np.ndarray:
-    """world_from_camera (4, 4), OpenCV axes, of a camera at `centre` that looks at `target`; roll in radians about its axis."""
-    centre, target = np.asarray(centre, np.float64), np.asarray(target, np.float64)
-    z = (target - centre) / np.linalg.norm(target - centre)
-    x = np.cross(z, up)
-    if np.linalg.norm(x) < 1e-6:  # straight above or below: any horizontal axis will do
-        x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    c, s = np.cos(roll), np.sin(roll)
-    return similarity(np.stack([c * x + s * y, c * y - s * x, z], axis=1), centre)
 
 
 def orbit_cameras(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from relit.conventions import move_pose, similarity
+from relit.cameras import se3
+from relit.conventions import move_pose
 from relit.errors import UserError
 from relit.scene import Camera
 
@@ -17,14 +18,10 @@ def umeyama(source, target, with_scale: bool = True) -> np.ndarray:
     x, y = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if len(x) < 3:
         raise UserError(f"{len(x)} matched points cannot fix a similarity", "at least 3 that are not on a line are needed")
-    mx, my = x.mean(0), y.mean(0)
-    u, d, vt = np.linalg.svd((y - my).T @ (x - mx) / len(x))
+    d = np.linalg.svd((y - y.mean(0)).T @ (x - x.mean(0)) / len(x), compute_uv=False)
     if d[1] < 1e-9 * max(d[0], 1e-30):
         raise UserError("the matched points lie on a line", "the rotation around that line is not determined")
-    s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u @ np.diag(s) @ vt
-    scale = float((d * s).sum() / np.square(x - mx).sum(1).mean()) if with_scale else 1.0
-    return similarity(rotation, my - scale * rotation @ mx, scale)
+    return se3.umeyama(x, y, with_scale)
 
 
 def align_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) -> np.ndarray:
@@ -51,9 +48,7 @@ def align_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) -> np.
 
 def rotation_angle(a, b) -> float:
     """Angle in degrees between two rotations (3, 3)."""
-    m = np.asarray(a, np.float64).T @ np.asarray(b, np.float64)
-    sine = np.linalg.norm([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]) / 2
-    return float(np.degrees(np.arctan2(sine, (np.trace(m) - 1) / 2)))
+    return se3.rotation_angle(np.asarray(a, np.float64).T @ np.asarray(b, np.float64))
 
 
 def pose_errors(recovered: dict[str, Camera], truth: dict[str, Camera], truth_from_recovered) -> tuple[np.ndarray, np.ndarray]:
