@@ -87,7 +87,8 @@ def open_as(path: Path, job: Job) -> tuple[Capture, str]:
     return capture, capture_kind(capture.kind or "multiview") if asked == "auto" else asked
 
 
-BESIDE = ("sparse", "masks", "mask", "segmentations", "silhouettes", "normals", "normal")  # folders whose files decide as well
+# folders whose files decide as well
+BESIDE = ("sparse", "relit-corrections", "masks", "mask", "segmentations", "silhouettes", "normals", "normal")
 
 
 def input_digests(capture: Capture) -> dict[str, str]:

@@ -1,5 +1,6 @@
 // The page: what is looked at, the panel, and the life of a run that is not over.
 import { CHANNELS } from "./channels.js";
+import { edit } from "./edit.js";
 import { choice, check, element, group, say, slider } from "./dom.js";
 import { decodeLight, plainLight } from "./light.js";
 import { showLive } from "./live.js";
@@ -16,7 +17,7 @@ async function main() {
   document.title = manifest.title;
   panel.append(element("h1", {}, manifest.title), element("p", {}, (manifest.facts ?? []).join(" · ")));
   window.relit = { manifest };
-  if (manifest.mode === "edit") return (await import("./edit.js")).edit(manifest, panel);
+  if (manifest.mode === "edit") return edit(manifest, panel);
   if (!manifest.asset) {
     say("no asset yet: the reconstruction is under way");
     return showLive(panel, manifest, () => location.reload());

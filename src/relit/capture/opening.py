@@ -11,6 +11,7 @@ import numpy as np
 
 from relit.cameras.pinhole import lens_of
 from relit.capture import colmap_model, idr, llff, middlebury, photo, transforms_json
+from relit.capture.corrections import Corrected, corrected_masks, corrected_sphere, with_corrected_masks
 from relit.capture.frames import Frame, Reading
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
 from relit.errors import UserError, did_you_mean
@@ -64,15 +65,22 @@ def open_capture(
     if any(p.load.normal for p in photos):
         notes.append(f"{sum(p.load.normal is not None for p in photos)} photos have normal priors")
     photos, small, dark = _masked(reading, headers, photos, masks, notes)
-    dropped = {i for i, m in enumerate(small) if m is not None and not (m > 0.5).any() and not reading.frames[i].held_out}
+    corrected = set() if masks == "none" else set(corrected_masks(reading.root))
+    empty = {i for i, m in enumerate(small) if m is not None and not (m > 0.5).any() and not reading.frames[i].held_out}
+    dropped = {i for i in empty if photos[i].name not in corrected}
     views = [View(f.camera, f.lens or lens_of(f.camera), m) if f.camera else None for f, m in zip(reading.frames, small, strict=True)]
     photos = [with_calibration(p, f) for p, f in zip(photos, reading.frames, strict=True)]
+    if corrected:
+        photos = with_corrected_masks(photos, reading.root, masks == "grabcut" or any(m is not None for m in small), notes)
     train = [i for i, f in enumerate(reading.frames) if not f.held_out and i not in dropped]
     held = [i for i, f in enumerate(reading.frames) if f.held_out]
 
     up = None
     if all(views[i] is not None for i in train):
         cameras = [photos[i].camera for i in train]
+        if sphere is None:
+            sphere = corrected_sphere(reading.root)
+            notes += ["the object sphere is the corrected one"] if sphere is not None else []
         sphere = sphere or reading.sphere
         if sphere is None:
             sphere, source = find_sphere([views[i] for i in train], reading.points)
@@ -100,6 +108,8 @@ def with_grabcut(capture: Capture) -> Capture:
     """The capture with masks that GrabCut guesses from the object sphere, for photos with cameras. Decodes every photo once."""
 
     def cut(p: Photo) -> Photo:
+        if isinstance(p.load, Corrected):
+            return p
         return photo.with_mask(p, grabcut(p.load().rgb, p.camera, capture.sphere))
 
     if capture.sphere is None or not capture.has_cameras:

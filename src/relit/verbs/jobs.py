@@ -40,6 +40,9 @@ def inspect_flags(parser: Parser) -> None:
     parser.common.add_argument("--quality", choices=QUALITIES, default="standard", help="for the estimate of time and memory")
     parser.common.add_argument("--plot", type=Path, default=None, metavar="FILE.svg", help="draw the cameras around the object sphere")
     parser.common.add_argument("--html", type=Path, default=None, metavar="FILE.html", help="a page with all that was looked at")
+    parser.more.add_argument("--edit", action="store_true", help="open a page where masks are painted and the object is boxed")
+    parser.more.add_argument("--port", type=int, default=0, help="of --edit, on 127.0.0.1 (default: a free one)")
+    parser.more.add_argument("--no-browser", action="store_true", help="of --edit: print the address only")
     opening_flags(parser)
 
 
@@ -51,6 +54,13 @@ def do_inspect(args) -> None:
         if path is not None:
             free(path, overwrite=False)
     job = Job(quality=args.quality, masks=args.masks or "auto", sphere=args.sphere, max_side=args.max_side)
+    if args.edit:
+        from relit.plan import open_as
+        from relit.viewer.correct import correction_server
+        from relit.viewer.serve import serve_until_stopped
+
+        server = correction_server(open_as(args.input, job)[0], args.port)
+        return serve_until_stopped(server, lambda text: print(text, flush=True), not args.no_browser)
     found = inspect(args.input, job, args.plot, args.html)
     print(json.dumps(found, indent=2) if args.json else as_text(found))
 

@@ -28,12 +28,20 @@ POLICY = (
 
 
 class Server(ThreadingHTTPServer):
-    """One folder on a loopback port. answers: {path: () -> JSON value}. posts: {path: (bytes, query) -> JSON value}."""
+    """One folder on a loopback port. answers: {path: () -> JSON value}. posts: {path: (bytes, query) -> JSON value}. pictures:
+    {path: query -> (bytes, type)}."""
 
     daemon_threads = True
 
-    def __init__(self, root: Path, answers: dict[str, Callable], posts: dict[str, Callable] | None = None, port: int = 0):
-        self.root, self.answers, self.posts = Path(root).resolve(), answers, posts or {}
+    def __init__(
+        self,
+        root: Path,
+        answers: dict[str, Callable],
+        posts: dict[str, Callable] | None = None,
+        pictures: dict[str, Callable] | None = None,
+        port: int = 0,
+    ):
+        self.root, self.answers, self.posts, self.pictures = Path(root).resolve(), answers, posts or {}, pictures or {}
         self.page = page_text().encode()
         super().__init__((LOOPBACK, port), Handler)
 
@@ -64,6 +72,12 @@ class Handler(BaseHTTPRequestHandler):
             return self._send(self.server.page, "text/html; charset=utf-8")
         if path.lstrip("/") in self.server.answers:
             return self._answer(self.server.answers[path.lstrip("/")])
+        if path.lstrip("/") in self.server.pictures:
+            try:
+                body, kind = self.server.pictures[path.lstrip("/")](urlsplit(self.path).query)
+            except (UserError, OSError, ValueError, LookupError) as error:
+                return self._refuse(HTTPStatus.NOT_FOUND, str(error))
+            return self._send(body, kind)
         if path.startswith("/files/"):
             return self._file(unquote(path[len("/files/") :]))
         return self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
@@ -96,7 +110,7 @@ class Handler(BaseHTTPRequestHandler):
             text = json.dumps(act(), allow_nan=False)
         except UserError as error:
             return self._send(json.dumps({"error": str(error)}).encode(), "application/json", HTTPStatus.UNPROCESSABLE_ENTITY)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, LookupError, TypeError) as error:
             text = json.dumps({"error": f"{type(error).__name__}: {error}"})
             return self._send(text.encode(), "application/json", HTTPStatus.INTERNAL_SERVER_ERROR)
         return self._send(text.encode(), "application/json")
