@@ -86,6 +86,16 @@ def test_from_rays_with_a_background():
     assert 0.8 < sphere.radius < 1.6
 
 
+def test_the_longer_side_of_the_pictures_counts():
+    """A tall object in upright photos is held from top to bottom."""
+    square = shots.ring(10, focal=100.0)
+    upright = [replace(c, height=2 * c.height, cy=2 * c.cy) for c in square]
+    small, large = s.sphere_from_rays(square).radius, s.sphere_from_rays(upright).radius
+    distance = np.linalg.norm(square[0].centre)
+    assert large == pytest.approx(min(distance * np.sin(np.arctan(upright[0].height / 200)), 0.8 * distance), rel=0.05)
+    assert large > 1.3 * small
+
+
 def test_a_stray_camera_does_not_move_the_sphere():
     cameras = shots.ring(9)
     stray = cameras[0].with_pose(look_at([4, 0, 0], [4, 30, 10]))

@@ -64,7 +64,8 @@ def robust_closest_point(origins: np.ndarray, directions: np.ndarray) -> np.ndar
 
 
 def sphere_from_rays(cameras: list[Camera]) -> Sphere:
-    """Sphere about the point nearest to all optical axes, as large as the mean of the two sides of the median picture shows.
+    """Sphere about the point nearest to all optical axes, as large as the longer side of the median picture shows, if no camera stands
+    in it. What it does not hold cannot be reconstructed; what it holds besides the object costs only resolution.
 
     Raises UserError when most cameras do not see that point.
     """
@@ -73,7 +74,7 @@ def sphere_from_rays(cameras: list[Camera]) -> Sphere:
     centre = robust_closest_point(origins, axes)
     seen = _seen(cameras, centre)
     distance = np.linalg.norm(origins - centre, axis=1)[seen]
-    half = np.array([np.arctan(0.5 * np.sqrt(c.width / c.fx * c.height / c.fy)) for c, s in zip(cameras, seen, strict=True) if s])
+    half = np.array([np.arctan(0.5 * max(c.width / c.fx, c.height / c.fy)) for c, s in zip(cameras, seen, strict=True) if s])
     radius = min(float(np.median(distance * np.sin(half))), 0.8 * float(distance.min()))
     return Sphere(centre, radius)
 
