@@ -22,7 +22,7 @@ ROWS = [
     ["fit"],
     ["asset"],
     ["relight", "edit", "evaluate", "viewer"],
-    ["plan", "preflight", "reconstruct", "demo", "benchmark", "doctor", "verbs", "cli", "__main__"],
+    ["plan", "preflight", "reconstruct", "demo", "benchmark", "doctor", "verbs", "cli", "api", "__main__"],
 ]
 LEVEL = {name: i for i, row in enumerate(ROWS) for name in row}
 BUILT_UPON = ("asset", "relight", "edit", "evaluate", "viewer")  # read asset folders only: never import `fit`

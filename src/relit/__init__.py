@@ -9,3 +9,21 @@ with contextlib.suppress(OSError):
     ctypes.CDLL("libz.so.1")
 
 __version__ = "0.1.0"
+__all__ = ["AssetFolder", "__version__", "inspect", "load", "open_capture", "reconstruct"]
+
+
+def __getattr__(name: str):
+    """The functions of `relit.api`, imported when they are asked for: `import relit` and `relit --help` stay quick."""
+    import importlib
+
+    if name == "open_capture":
+        return importlib.import_module("relit.capture").open_capture
+    if name in ("AssetFolder", "inspect", "load"):
+        return getattr(importlib.import_module("relit.api"), name)
+    if name == "reconstruct":
+        return importlib.import_module("relit.reconstruct")  # the module, which can be called
+    raise AttributeError(f"module 'relit' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return __all__

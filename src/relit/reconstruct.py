@@ -6,8 +6,10 @@ import dataclasses
 import json
 import platform
 import shutil
+import sys
 from collections.abc import Iterable
 from pathlib import Path
+from types import ModuleType
 
 from relit import __version__
 from relit.errors import UserError
@@ -155,3 +157,16 @@ def versions() -> dict[str, str]:
     from importlib.metadata import version
 
     return {"relit": __version__, "python": platform.python_version(), **{n: version(n) for n in ("mitsuba", "drjit", "numpy")}}
+
+
+class _Callable(ModuleType):
+    """`relit.reconstruct(...)` is this module being called: a package cannot hold a module and a function of one name."""
+
+    def __call__(self, input: str | Path, out: str | Path, **options):
+        """See `relit.api.reconstruct`."""
+        from relit import api
+
+        return api.reconstruct(input, out, **options)
+
+
+sys.modules[__name__].__class__ = _Callable
