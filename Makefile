@@ -1,8 +1,8 @@
-# make setup | demo | test | lint | bench | viewer | validator | clean
+# make setup | demo | test | lint | bench | viewer | validator | dist | clean
 VENV ?= .venv
 NICE ?=
 
-.PHONY: setup demo test lint bench viewer validator clean
+.PHONY: setup demo test lint bench viewer validator dist clean
 .DEFAULT_GOAL := setup
 
 # virtual environment, wheels, libLLVM; returns at once when nothing has changed
@@ -35,6 +35,12 @@ src/relit/viewer/static/index.html: $(VIEWER)
 	  (cd viewer && { [ node_modules/.package-lock.json -nt package-lock.json ] || npm ci --silent --no-audit --no-fund; } && npm run --silent build -- --logLevel warn) \
 	  || echo "npm could not build the page; relit view says so" >&2; \
 	else echo "no npm: the page of relit view is not built" >&2; fi
+
+# what is published: a source archive and a wheel with the page in it
+dist: setup viewer
+	@test -f src/relit/viewer/static/index.html || { echo "error: the page is not built; a wheel needs it" >&2; exit 5; }
+	rm -rf dist build
+	$(VENV)/bin/python -m build --outdir dist .
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache tools/validator/node_modules viewer/node_modules src/relit/viewer/static src/relit.egg-info

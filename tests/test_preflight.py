@@ -188,7 +188,7 @@ def test_photos_without_texture_are_not_matched(tmp_path):
 def test_widest_gap():
     ring = np.array([[np.cos(a), 0, np.sin(a)] for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)])
     assert widest_gap(ring) == pytest.approx(90, abs=5)  # nobody looked from above
-    assert widest_gap(ring[:6] + [0, 0.5, 0]) > 60
+    assert widest_gap(ring[:6]) > 80 > 60 > widest_gap(np.concatenate([ring, ring[:, [1, 0, 2]]]))
 
 
 def test_the_page(tmp_path, capsys):

@@ -1,5 +1,10 @@
 // One self-contained HTML file: script and style are put into the page, so that it also opens from an e-mail.
+import { readFileSync } from "node:fs";
 import { defineConfig } from "vite";
+
+// The licences of what is built in ask that their notices go along.
+const { dependencies } = JSON.parse(readFileSync("package.json", "utf8"));
+const notices = Object.entries(dependencies).map(([name, version]) => `${name} ${version}\n\n${readFileSync(`node_modules/${name}/LICENSE`, "utf8").trim()}`);
 
 const inline = {
   name: "inline",
@@ -17,7 +22,7 @@ const inline = {
         delete bundle[name];
       }
     }
-    page.source = html;
+    page.source = html.replace("<html", () => `<!--\n${notices.join("\n\n").replaceAll("--", "- -")}\n-->\n<html`);
   },
 };
 

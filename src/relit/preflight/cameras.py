@@ -120,12 +120,14 @@ def coverage(capture: Capture) -> dict | None:
     if not capture.has_cameras or capture.sphere is None:
         return None
     sphere, cameras = capture.sphere, [p.camera for p in capture.photos]
+    guessed = any("viewing directions" in note for note in capture.notes)  # as large as the photos show: they cannot cut it off
     fill, cut, towards = [], [], []
     for photo, camera in zip(capture.photos, cameras, strict=True):
         x, y, z = camera.project(sphere.centre)
         r = camera.fx * sphere.radius / max(z, 1e-9)
         fill.append(2 * r / min(camera.width, camera.height))
-        if z <= 0 or x - 0.6 * r < 0 or y - 0.6 * r < 0 or x + 0.6 * r > camera.width or y + 0.6 * r > camera.height:
+        outside = z <= 0 or x - 0.6 * r < 0 or y - 0.6 * r < 0 or x + 0.6 * r > camera.width or y + 0.6 * r > camera.height
+        if outside and not guessed:
             cut.append(photo.name)
         towards.append((camera.centre - sphere.centre) / max(np.linalg.norm(camera.centre - sphere.centre), 1e-12))
     return {

@@ -57,7 +57,7 @@ def warnings_of(found: dict, has_masks: bool) -> list[dict]:
     elif spread is None and has_masks and found["exposure_spread"] > 3.5 * EXPOSURE_DRIFT:
         what = f"the object's brightness varies by {found['exposure_spread']:.1f} EV from photo to photo"
         out.append({"what": what, "fix": "lock exposure, or look at the light regime"})
-    if has_masks and found["tint_spread"] > 2 * TINT_DRIFT:
+    if has_masks and found["tint_spread"] > 4.5 * TINT_DRIFT:
         what = f"the object's colour varies by {found['tint_spread']:.2f} (log2) between photos"
         out.append({"what": what, "fix": "lock white balance; mixed light shows so as well"})
     if found["blurred"]:

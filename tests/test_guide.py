@@ -1,0 +1,131 @@
+"""The guide is true: its examples run, its commands parse, its links lead somewhere, its tables name what is there."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_faults import write_capture
+
+from relit.asset.asset import load_asset
+from relit.errors import UserError
+from relit.evaluate.definitions import DEFINITIONS
+from relit.files import parse_toml
+from relit.verbs import VERBS, parser_for
+from relit.viewer.page import PAGE
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+TINY = {"levels": (16,), "level_steps": (12,), "rays": 128, "faces": 300, "texture": 16, "light": 4}
+TINY |= {"surface_steps": 4, "points": 32, "directions": 4}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("guide")
+    write_capture(out / "photos")
+    return out
+
+
+def example(monkeypatch, capsys, number, *argv) -> str:
+    path = next(p for p in EXAMPLES if p.name.startswith(f"{number:02d}_"))
+    monkeypatch.setattr(sys, "argv", [str(path), *map(str, argv)])
+    runpy.run_path(str(path), run_name="__main__")
+    return capsys.readouterr().out
+
+
+def test_examples_in_their_order(monkeypatch, capsys, folder):
+    import relit.fit.multiview as multiview
+    from relit.evaluate import report
+
+    monkeypatch.setitem(multiview.PRESETS, "draft", TINY)
+    for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1}.items():
+        monkeypatch.setattr(report, name, value)
+    run = folder / "run"
+    assert "6 photos, read as transforms" in example(monkeypatch, capsys, 1, folder / "photos")
+    said = example(monkeypatch, capsys, 2, folder / "photos", run)
+    assert "triangles" in said and (run / "asset/object.glb").is_file()
+    assert len(example(monkeypatch, capsys, 3, run, folder / "out").splitlines()) == 3
+    if PAGE.is_file():
+        assert "fetches nothing" in example(monkeypatch, capsys, 4, run, folder / "page.html")
+    example(monkeypatch, capsys, 5, run, folder / "glossy.glb")
+    from relit.asset.gltf import read_asset_file
+
+    assert read_asset_file(folder / "glossy.glb")[1].roughness.max() <= 0.26 and np.isfinite(load_asset(run).mesh.vertices).all()
+
+
+def test_examples_are_numbered_and_say_how_they_are_run():
+    assert [int(p.name[:2]) for p in EXAMPLES] == list(range(1, len(EXAMPLES) + 1))
+    assert all(f"python examples/{p.name} " in p.read_text() for p in EXAMPLES)
+
+
+def commands():
+    for page in PAGES:
+        for block in re.findall(r"```[a-z]*\n(.*?)```", page.read_text(encoding="utf-8"), re.S):
+            for line in block.splitlines():
+                line = re.sub(r"^(\$ |\.venv/bin/)", "", line.strip()).split(" #")[0]
+                if line.startswith("relit ") and "VERB" not in line:
+                    yield pytest.param(line, id=f"{page.name}: {line}")
+
+
+@pytest.mark.parametrize("line", commands())
+def test_every_command_of_the_guide_parses(line):
+    verb, *words = shlex.split(line.replace("[", "").replace("]", "").replace("...", ""))[1:]
+    assert verb in VERBS, line
+    try:
+        assert parser_for(verb, words).parse(words) is not None
+    except UserError as error:
+        pytest.fail(f"{line}: {error}")
+
+
+def test_every_link_leads_somewhere():
+    lost = []
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            if "://" not in target and not (page.parent / target).exists():
+                lost.append(f"{page.name}: {target}")
+    assert not lost
+
+
+def test_every_flag_of_the_table_is_one():
+    parsers = [parser_for(verb, [kind] if kind else []) for verb, spec in VERBS.items() for kind in (list(spec.kinds) or [None])]
+    known = {o for parser in parsers for a in parser._actions for o in a.option_strings}
+    told = set(re.findall(r"`(--?[a-z][a-z-]*)`", (ROOT / "docs/flags.md").read_text()))
+    assert told - known == set() and len(told) > 25
+    assert all(
+        f"## relit {verb}\n" in (ROOT / "docs/flags.md").read_text() for verb in ("doctor", "inspect", "reconstruct", "view", "export")
+    )
+
+
+def test_every_figure_is_explained():
+    told = set(re.findall(r"^\| `([a-z_]+)` \|", (ROOT / "docs/figures.md").read_text(), re.M))
+    assert told <= set(DEFINITIONS) | {"seconds", "peak_memory", "glb_roundtrip_psnr"} and len(told) > 10
+
+
+def test_every_dependency_is_listed_with_its_licence():
+    text = (ROOT / "docs/licences.md").read_text().lower()
+    project = parse_toml((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *[n for names in project["optional-dependencies"].values() for n in names]]
+    names = [re.split(r"[\s<>=!~;\[]", w, maxsplit=1)[0].lower() for w in wanted]
+    for folder in ("viewer", "tools/validator"):
+        package = json.loads((ROOT / folder / "package.json").read_text())
+        names += [*package.get("dependencies", {}), *package.get("devDependencies", {})]
+    assert [n for n in names if f"| {n}" not in text and n != "tomli"] == []
+    assert "see its page" not in text
+
+
+def test_what_is_published_carries_the_page_and_its_notices():
+    assert (
+        "viewer/static" in (ROOT / "pyproject.toml").read_text() and "graft src/relit/viewer/static" in (ROOT / "MANIFEST.in").read_text()
+    )
+    if not PAGE.is_file():
+        pytest.skip("the page is not built (make viewer)")
+    text = PAGE.read_text(encoding="utf-8")
+    assert "three.js authors" in text[:6000] and "Garrett Johnson" in text[:6000] and "Permission is hereby granted" in text[:6000]
