@@ -9,16 +9,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from lump import lump
 
 from relit.cameras.se3 import look_at
 from relit.conventions import environment_directions
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank
+from relit.fit.surface import SurfaceOptions, dual_loss, light_prior, material_prior, neighbours
 from relit.geometry.sdf import make_grid, node_positions
+from relit.lighting.environment import Environment
+from relit.materials.field import material_at, start_material
 from relit.rendering import background as bg
 from relit.rendering import shade as shading
 from relit.rendering.march import march, sphere_interval
 from relit.rendering.shade import CHANNELS, shade
+from relit.rendering.transport import TraceableMesh, first_hits, reflected, sample_lights
 from relit.scene import Camera
 
 PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
@@ -28,6 +33,9 @@ PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
     "background": (("volume",), 1e-2),
     "rotations": (("matt", "saddle"), 1e-4),
     "translations": (("matt", "saddle"), 2e-4),
+    "colour": (("surface",), 1e-3),
+    "metallic": (("surface",), 1e-3),
+    "log_light": (("surface",), 2e-3),
 }
 N, SIZE, VIEWS = 16, 10, 4
 ROUND = ([2.5, 0.3, 0.2], [-1, 2, 1], [0.2, -0.8, 2.4], [0.4, 1.5, -2])
@@ -36,7 +44,7 @@ ABOVE = ([0.5, 0.3, 2.2], [-0.5, 0.6, 2.0], [0.2, -0.8, 2.4], [0.4, 0.7, 2.0])
 
 def smooth_map() -> np.ndarray:
     """Log radiance that changes little from texel to texel: the kinks of a bilinear look-up are none of a gradient's."""
-    sizes = shading.MAPS if hasattr(shading, "MAPS") else ((shading.ROWS, shading.COLUMNS),)
+    sizes = ((shading.ROWS, shading.COLUMNS),)
     d = np.concatenate([environment_directions(*size).reshape(-1, 3) for size in sizes])
     waves = [np.sin(2 * d[:, k] + c) * np.cos(1.5 * d[:, (k + 1) % 3]) for k, c in enumerate((0.3, 1.0, 2.0))]
     return (np.stack(waves, -1) * 0.8 - 1).astype(np.float32).ravel()
@@ -109,7 +117,54 @@ class VolumeScene:
         return loss + self.normal * normal_loss(normal, batch.normal, batch.has_normal * m.opacity)
 
 
-SCENES = {kind: lambda k=kind: VolumeScene(k) for kind in ("volume", "matt", "saddle")}
+class SurfaceScene:
+    """The surface pass's loss for fixed points, directions, visibility and neighbours: two estimates against the photo, all priors."""
+
+    def __init__(self):
+        rng = np.random.default_rng(1)
+        self.options = SurfaceOptions(texture=8, light=6, smooth_colour=0.2)
+        mesh, _ = lump()
+        self.mesh = TraceableMesh(mesh, rng.uniform(0.1, 0.6, mesh.vertices.shape))
+        self.field = start_material(8, rng.uniform(0.1, 0.8, (8, 8, 3)), 0.45, 0.3)
+        camera = Camera(SIZE, SIZE, 2.0 * SIZE, 2.0 * SIZE, SIZE / 2, SIZE / 2, look_at([1.2, 1.0, 1.4]))
+        batch = batch_of(make_bank([camera], [np.zeros((SIZE, SIZE, 3), np.float32)], [None]), mi.UInt32(np.arange(SIZE * SIZE)))
+        self.points = first_hits(self.mesh, batch.o, batch.d)
+        self.target = mi.Color3f(*[mi.Float(rng.uniform(0.1, 0.9, SIZE * SIZE)) for _ in range(3)])
+        lanes = mi.PCG32(size=SIZE * SIZE, initstate=1)
+        self.near = neighbours(self.mesh, self.points, 0.15, lanes)
+        colour = np.array(self.field.colour).reshape(-1, 4)
+        colour[:, 3] = rng.uniform(0.3, 0.7, len(colour))
+        d = environment_directions(6, 12)
+        self.start = {
+            "colour": colour.astype(np.float32).ravel(),
+            "metallic": rng.uniform(0.1, 0.9, 64).astype(np.float32),
+            "log_light": (0.7 * np.sin(2 * d + [0, 1, 2])).astype(np.float32).ravel(),
+        }
+        x = {k: mi.Float(v) for k, v in self.start.items()}
+        with dr.suspend_grad():
+            surface, environment = self.place(x)
+            self.lights = sample_lights(self.mesh, self.points, surface, environment, 16, lanes)
+        self.valid = self.points.valid & (dr.dot(self.points.n, self.points.v) > 0.2)
+        self.environment = environment
+
+    def place(self, x):
+        """The material and light of the parameters."""
+        self.field.colour, self.field.metallic = x["colour"], x["metallic"]
+        radiance = dr.exp(x["log_light"])
+        if not hasattr(self, "environment"):
+            return material_at(self.field, self.points.uv, self.points.valid), Environment(radiance, 6, 12)
+        self.environment.radiance = radiance
+        return material_at(self.field, self.points.uv, self.points.valid), self.environment
+
+    def loss(self, x):
+        surface, environment = self.place(x)
+        a, b = reflected(self.points, self.lights, surface, environment)
+        fit = dual_loss(a, b, self.target, self.valid)
+        prior = material_prior(self.field, surface, self.near, self.valid, self.options, mi.Float(self.options.smooth_colour))
+        return fit + prior + light_prior(x["log_light"], self.options)
+
+
+SCENES = {"surface": SurfaceScene} | {kind: lambda k=kind: VolumeScene(k) for kind in ("volume", "matt", "saddle")}
 
 
 @pytest.fixture(scope="module")
