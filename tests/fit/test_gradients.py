@@ -20,9 +20,8 @@ from relit.geometry.sdf import make_grid, node_positions
 from relit.lighting.environment import Environment
 from relit.materials.field import material_at, start_material
 from relit.rendering import background as bg
-from relit.rendering import shade as shading
 from relit.rendering.march import march, sphere_interval
-from relit.rendering.shade import CHANNELS, shade
+from relit.rendering.shade import CHANNELS, COLUMNS, ROWS, shade
 from relit.rendering.transport import TraceableMesh, first_hits, reflected, sample_lights
 from relit.scene import Camera
 
@@ -44,8 +43,7 @@ ABOVE = ([0.5, 0.3, 2.2], [-0.5, 0.6, 2.0], [0.2, -0.8, 2.4], [0.4, 0.7, 2.0])
 
 def smooth_map() -> np.ndarray:
     """Log radiance that changes little from texel to texel: the kinks of a bilinear look-up are none of a gradient's."""
-    sizes = ((shading.ROWS, shading.COLUMNS),)
-    d = np.concatenate([environment_directions(*size).reshape(-1, 3) for size in sizes])
+    d = environment_directions(ROWS, COLUMNS).reshape(-1, 3)
     waves = [np.sin(2 * d[:, k] + c) * np.cos(1.5 * d[:, (k + 1) % 3]) for k, c in enumerate((0.3, 1.0, 2.0))]
     return (np.stack(waves, -1) * 0.8 - 1).astype(np.float32).ravel()
 
