@@ -12,6 +12,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -390,3 +391,125 @@ def test_the_valid_files_are_read(valid, tmp_path):
         (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {file}\n")
         with pytest.raises(UserError, match="outside its folder"):
             read_asset_file(tmp_path / "a.obj")
+
+
+# ---------------------------------------------------------------- other readers
+
+
+COLMAP = """
+import random, shutil, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from shots import ring, write_colmap_text, write_photos
+import pycolmap
+from relit.capture import open_capture
+from relit.errors import UserError
+root = Path(sys.argv[2])
+cameras = ring(4)
+write_photos(root / "images", cameras)
+model = root / "sparse/0"
+write_colmap_text(model, cameras, sorted(p.name for p in (root / "images").iterdir()), points=[(0, 0, 0), (0.1, 0.2, 0.3)])
+text = {p.name: p.read_bytes() for p in model.iterdir()}
+(root / "binary").mkdir()
+pycolmap.Reconstruction(str(model)).write_binary(str(root / "binary"))
+binary = {p.name: p.read_bytes() for p in (root / "binary").iterdir()}
+shutil.rmtree(root / "binary")
+assert len(open_capture(root, masks="none").photos) == 4
+rng, answers = random.Random(7), {"read": 0, "refused": 0}
+for turn in range(160):
+    for path in model.iterdir():
+        path.unlink()
+    files = dict(binary if turn % 2 else text)
+    name = rng.choice(sorted(files))
+    data = bytearray(files[name])
+    for _ in range(rng.randint(0, 4)):
+        if data:
+            at, n = rng.randrange(len(data)), rng.randint(1, 8)
+            data[at : at + n] = bytes(rng.choice([0, 255, rng.randrange(256)]) for _ in range(n))
+    files[name] = bytes(data[: rng.randrange(len(data) + 1)] if rng.random() < 0.3 else data)
+    for file, content in files.items():
+        (model / file).write_bytes(content)
+    try:
+        open_capture(root, masks="none")
+        answers["read"] += 1
+    except UserError:
+        answers["refused"] += 1
+print(answers["read"], answers["refused"])
+"""
+
+
+def test_spoilt_colmap_models(tmp_path):
+    """In another process: the reader is native code, which may end the process or read for ever."""
+    here = Path(__file__).parent / "capture"
+    done = subprocess.run([sys.executable, "-c", COLMAP, str(here), str(tmp_path)], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr[-2000:]
+    read, refused = map(int, done.stdout.split())
+    assert read > 10 and refused > 50
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["cameras_sphere.npz", "poses_bounds.npy", "a_par.txt"])
+def test_spoilt_camera_arrays(tmp_path, name):
+    (tmp_path / "image").mkdir()
+    poses = [np.linalg.inv(look_at([3 * np.sin(i), 1, 3 * np.cos(i)], np.zeros(3))) for i in range(4)]
+    for i in range(4):
+        Image.fromarray(np.full((8, 8, 3), 40 * i, np.uint8)).save(tmp_path / f"image/{i:03d}.png")
+    k = np.array([[10, 0, 4, 0], [0, 10, 4, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    path = tmp_path / name
+    if name.endswith(".npz"):
+        np.savez(path, **{f"world_mat_{i}": k @ p for i, p in enumerate(poses)}, **{f"scale_mat_{i}": np.eye(4) for i in range(4)})
+    elif name.endswith(".npy"):
+        axes = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]])  # down, right, back
+        rows = [np.concatenate([np.column_stack([(np.linalg.inv(p) @ axes)[:3], [8, 8, 10]]).ravel(), [1, 5]]) for p in poses]
+        np.save(path, np.array(rows))
+    else:
+        (tmp_path / "image").rename(tmp_path / "other")
+        for i in range(4):
+            (tmp_path / f"other/{i:03d}.png").rename(tmp_path / f"{i:03d}.png")
+        line = lambda i, p: " ".join(map(str, [f"{i:03d}.png", *k[:3, :3].ravel(), *p[:3, :3].ravel(), *p[:3, 3]]))  # noqa: E731
+        path.write_text("4\n" + "\n".join(line(i, p) for i, p in enumerate(poses)) + "\n")
+    good = path.read_bytes()
+    assert len(open_capture(tmp_path, masks="none").photos) == 4
+
+    @FUZZ
+    @given(cuts, pokes, st.sampled_from([0, 10, 128]))
+    def run(cut, changes, head):
+        path.write_bytes(spoilt(good, cut, changes, head))
+        answers(lambda p: open_capture(p, masks="none"), tmp_path)
+
+    run()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_spoilt_obj_files(valid, tmp_path):
+    (tmp_path / "a.glb").write_bytes(valid["a.glb"])
+    mesh, material = read_asset_file(tmp_path / "a.glb")
+    from relit.asset.obj import write_obj
+
+    write_obj(tmp_path / "a.obj", mesh, material)
+    good = {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.suffix in (".obj", ".mtl")}
+    assert len(good) == 2
+
+    @FUZZ
+    @given(st.sampled_from(sorted(good)), cuts, pokes)
+    def run(name, cut, changes):
+        (tmp_path / name).write_bytes(spoilt(good[name], cut, changes))
+        answers(read_asset_file, tmp_path / "a.obj")
+        (tmp_path / name).write_bytes(good[name])
+
+    run()
+
+
+def test_spoilt_configurations(tmp_path):
+    from relit.plan import plan_job
+
+    path = tmp_path / "config.toml"
+    good = b'capture = "multiview"\nquality = "draft"\nseed = 3\nsphere = [0.0, 0.0, 0.0, 1.0]\n\n[settings]\nrays = 100\n'
+
+    @FUZZ
+    @given(cuts, pokes)
+    def run(cut, changes):
+        path.write_bytes(spoilt(good, cut, changes))
+        answers(lambda p: plan_job({}, p), path)
+
+    run()

@@ -8,7 +8,10 @@ import hashlib
 import json
 import os
 import shutil
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -42,6 +45,11 @@ def save_arrays(path: Path, arrays: dict) -> None:
                     np.lib.format.write_array(member, value, allow_pickle=False)
 
     _atomic(path, write)
+
+
+# what np.load raises for damaged files, its header being parsed as Python
+NO_ARRAYS = (OSError, ValueError, TypeError, EOFError, LookupError, SyntaxError, MemoryError, NotImplementedError)
+NO_ARRAYS = (*NO_ARRAYS, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error)
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:

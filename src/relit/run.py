@@ -16,14 +16,13 @@ import shutil
 import signal
 import time
 import weakref
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError
-from relit.files import disk_errors, load_arrays, parse_toml, read_json, save_arrays, toml_text, write_text
+from relit.files import NO_ARRAYS, disk_errors, load_arrays, parse_toml, read_json, save_arrays, toml_text, write_text
 from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_seconds
 
 CHECKPOINT_SECONDS = 20.0  # a checkpoint is due this long after the last one, later if writing one is slow
@@ -194,7 +193,7 @@ class Stage:
             return None
         try:
             return load_arrays(path)
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        except NO_ARRAYS as error:
             self.run.say(f"checkpoint {name} of stage {self.name} cannot be read and is left out ({type(error).__name__}): {path}")
             return None
 

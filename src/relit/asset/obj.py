@@ -35,7 +35,7 @@ def read_obj(path: Path) -> tuple[Mesh, Material]:
             elif w[0] == "vn":
                 vn.append([float(x) for x in w[1:4]])
             elif w[0] == "mtllib":
-                materials.update(_read_mtl(path.parent / " ".join(w[1:])))
+                materials.update(_read_mtl(inside(path.parent, " ".join(w[1:]))))
             elif w[0] == "usemtl":
                 current = " ".join(w[1:])
             elif w[0] == "f":
@@ -43,12 +43,14 @@ def read_obj(path: Path) -> tuple[Mesh, Material]:
                     tuple(_index(x, n) for x, n in zip((*c.split("/"), "", "")[:3], (len(v), len(vt), len(vn)), strict=True)) for c in w[1:]
                 ]
                 groups.setdefault(current, []).extend((corners[0], a, b) for a, b in pairwise(corners[1:]))
-    except (ValueError, IndexError) as e:
+        if any(len(x) != 3 for x in (*v, *vn)):
+            raise ValueError("a vertex or a normal has not three coordinates")
+        v, vt, vn = (np.array(a, np.float64).reshape(-1, n) for a, n in ((v, 3), (vt, 2), (vn, 3)))
+        groups = {name: np.array(triangles, np.int64).reshape(-1, 3) for name, triangles in groups.items()}
+    except (ValueError, IndexError, OverflowError) as e:
         raise UserError("the OBJ file cannot be read", f"{type(e).__name__}: {e}", f"export it again: {path}") from None
-    v, vt, vn = np.array(v, np.float64).reshape(-1, 3), np.array(vt, np.float64).reshape(-1, 2), np.array(vn, np.float64).reshape(-1, 3)
     parts = []
-    for name, triangles in groups.items():
-        c = np.array(triangles, np.int64).reshape(-1, 3)
+    for name, c in groups.items():
         unique, faces = np.unique(c, axis=0, return_inverse=True)
         if (unique[:, 0] < 0).any() or (unique >= (len(v), max(len(vt), 1), max(len(vn), 1))).any():
             raise UserError("the OBJ file's faces refer to vertices that are not there", fix=f"export it again: {path}")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from relit.cameras.pinhole import FisheyeLens, Lens
+from relit.capture.colmap_binary import check_binary
 from relit.capture.frames import IMAGE_FOLDERS, Frame, Reading, inside
 from relit.device import load_pycolmap
 from relit.errors import UserError
@@ -60,6 +61,7 @@ def read(path: Path, found: Path) -> Reading:
     models, notes = [], []
     for folder in model_folders(path):
         try:
+            check_binary(folder)
             models.append((pycolmap.Reconstruction(str(folder)), folder))
         except (RuntimeError, ValueError, IndexError, MemoryError, OSError) as error:
             raise UserError("a COLMAP model cannot be read", str(error).splitlines()[0][:200], f"export it again: {folder}") from error
@@ -70,7 +72,11 @@ def read(path: Path, found: Path) -> Reading:
     root = (
         path if path != folder else next((p for p in (folder, *folder.parents[:2]) if any((p / n).is_dir() for n in IMAGE_FOLDERS)), folder)
     )
-    return Reading("colmap", root, tuple(_frames(model, root, folder, notes)), points=sparse_points(model), notes=tuple(notes))
+    try:
+        frames = tuple(_frames(model, root, folder, notes))
+    except (RuntimeError, ValueError, IndexError, ZeroDivisionError) as error:
+        raise UserError("a COLMAP model cannot be used", str(error).splitlines()[0][:200], f"export it again: {folder}") from None
+    return Reading("colmap", root, frames, points=sparse_points(model), notes=tuple(notes))
 
 
 def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
@@ -86,6 +92,9 @@ def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
             missing.append(image.name)
             continue
         camera, lens = camera_from_colmap(image.camera, world_from_camera(image))
+        numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion, *camera.world_from_camera.ravel()]
+        if min(camera.width, camera.height, camera.fx, camera.fy) <= 0 or not np.isfinite(numbers).all() or not is_pose(camera):
+            raise ValueError(f"the camera of {image.name} makes no sense")
         frames.append(Frame(file, file.relative_to(root).as_posix(), camera, lens))
     if not frames or len(missing) > len(frames) + 1:
         raise UserError(
@@ -96,6 +105,11 @@ def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
     if missing:
         notes.append(f"{len(missing)} photos of the COLMAP model are not there and were left out, for example {missing[0]}")
     return frames
+
+
+def is_pose(camera: Camera) -> bool:
+    """Is the rotation one? A damaged quaternion may be zero."""
+    return abs(np.linalg.det(camera.world_from_camera[:3, :3]) - 1) < 1e-3
 
 
 def world_from_camera(image) -> np.ndarray:

@@ -6,7 +6,6 @@ NeuS sample rays there), so half a pixel is added to the principal point. Photos
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from scipy.linalg import rq
 from relit.capture.frames import Frame, Reading, image_folder, list_images
 from relit.conventions import scale_of
 from relit.errors import UserError
+from relit.files import NO_ARRAYS
 from relit.images import read_header
 from relit.scene import Camera, Sphere
 
@@ -33,7 +33,7 @@ def read(path: Path, found: Path) -> Reading:
     try:
         with np.load(found, allow_pickle=False) as data:
             arrays = {k: data[k] for k in data.files if k.startswith(("world_mat_", "scale_mat_")) and "inv" not in k}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+    except NO_ARRAYS as error:
         raise UserError("a camera file cannot be read", str(error), f"write it again: {found}") from error
     indices = sorted(int(k[10:]) for k in arrays if k.startswith("world_mat_") and k[10:].isdigit())
     folder = image_folder(found.parent)

@@ -11,6 +11,7 @@ import numpy as np
 
 from relit.capture.frames import Frame, Reading, image_folder, list_images, pose_from
 from relit.errors import UserError
+from relit.files import NO_ARRAYS
 from relit.scene import Camera
 
 LOOKED_FOR = "poses_bounds.npy (LLFF)"
@@ -27,7 +28,7 @@ def read(path: Path, found: Path) -> Reading:
     """Read the pose file."""
     try:
         rows = np.load(found, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except NO_ARRAYS as error:
         raise UserError("a pose file cannot be read", str(error), f"write it again: {found}") from error
     if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind != "f" or not np.isfinite(rows).all():
         raise UserError(
