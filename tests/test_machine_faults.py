@@ -93,11 +93,31 @@ def stop_when(process, log: Path, said: str, number: int) -> int:
     return process.returncode
 
 
-@pytest.mark.parametrize("stage", ["shape (volume pass)", "mesh and atlas", "material and light (surface pass)", "asset", "report"])
+# kill -9 in the stage of a name: soon after it began, or at its end at the latest
+KILLED = """
+import contextlib, os, sys, threading
+from relit.run import Run
+begin, doomed = Run.stage, sys.argv.pop(1)
+@contextlib.contextmanager
+def stage(self, name, **about):
+    with begin(self, name, **about) as entered:
+        if name != doomed:
+            yield entered
+            return
+        timer = threading.Timer(0.03, os.kill, (os.getpid(), 9))
+        timer.start()
+        yield entered
+        timer.join()
+Run.stage = stage
+"""
+
+
+@pytest.mark.parametrize("stage", ["volume", "mesh", "surface", "asset", "report"])
 def test_kill_9_in_any_stage_and_the_same_command(capsys, capture, finished, tmp_path, stage):
     run = tmp_path / "run"
     words = ["reconstruct", capture, "-o", run, *WORDS]
-    assert stop_when(start(*words), run / "log.txt", f"{stage}: begun", signal.SIGKILL) == -signal.SIGKILL
+    process = subprocess.run([sys.executable, "-c", KILLED + JOB, stage, *map(str, words)], capture_output=True, timeout=100)
+    assert process.returncode == -signal.SIGKILL and not (run / "stages" / stage / "DONE").exists()
     assert not (run / "report.html").exists()
     code, _, err = relit(capsys, *words)
     assert code == 0, err
@@ -159,7 +179,8 @@ def test_a_photo_replaced_during_the_run(capture, tmp_path):
     photos, run = tmp_path / "photos", tmp_path / "run"
     shutil.copytree(capture, photos)
     before = (photos / "images/p0.png").read_bytes()
-    process = start("reconstruct", photos, "-o", run, *WORDS)
+    words = ["reconstruct", photos, "-o", run, *WORDS, "--set", "surface_steps=80"]
+    process = start(*words)
     log = run / "log.txt"
     while process.poll() is None and not (log.exists() and "shape (volume pass): begun" in log.read_text(encoding="utf-8")):
         time.sleep(0.002)
@@ -168,7 +189,7 @@ def test_a_photo_replaced_during_the_run(capture, tmp_path):
     answered(process.returncode, err, 3, "p0.png")
     assert not (run / "asset").exists()
     (photos / "images/p0.png").write_bytes(before)
-    process = start("reconstruct", photos, "-o", run, *WORDS)
+    process = start(*words)
     _, err = process.communicate(timeout=100)
     assert process.returncode == 0, err
 
@@ -257,18 +278,19 @@ def watched(self, i, /, **losses):
 Stage.step = watched
 from relit.reconstruct import reconstruct
 settings = {"levels": [16], "level_steps": [500], "rays": 128, "faces": 300, "texture": 16, "light": 4}
-settings |= {"surface_steps": 500, "points": 32, "directions": 4}
+settings |= {"surface_steps": 500, "points": 32, "directions": 4, "background": 16, "explore_steps": 500}
 reconstruct(sys.argv[1], sys.argv[2], quality="draft", device="cpu", settings=settings, masks=sys.argv[3], report=False)
 for name in {n for n, _ in seen}:
     print(name, seen[name, 500] - seen[name, 150])
 """
 
 
-def test_memory_stays_flat_over_500_steps(capture, tmp_path):
-    """Of the volume pass and of the surface pass: what a step allocates it gives back."""
-    command = [sys.executable, "-c", FLAT, str(capture), str(tmp_path / "run"), "auto"]
+@pytest.mark.parametrize("masks, passes", [("auto", {"volume", "surface"}), ("none", {"explore", "volume", "surface"})])
+def test_memory_stays_flat_over_500_steps(capture, tmp_path, masks, passes):
+    """Of every pass: what a step allocates it gives back."""
+    command = [sys.executable, "-c", FLAT, str(capture), str(tmp_path / "run"), masks]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     grown = {line.split()[0]: float(line.split()[1]) for line in done.stdout.splitlines() if len(line.split()) == 2}
-    assert {"volume", "surface"} <= set(grown), done.stdout
+    assert passes <= set(grown), done.stdout
     assert all(mb < 6 for mb in grown.values()), grown

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -218,6 +219,64 @@ def test_a_run_at_work(drive, built, asset, tmp_path):
     assert drive(server.url, [READY, {"eval": "relit.manifest.title"}]) == ["mug"]
     server.shutdown()
     server.server_close()
+
+
+def test_copies_and_a_light_for_each_photo(drive, built, asset, run_folder, tmp_path):
+    """Two instances as the duplicates capture writes them, against Mitsuba's picture of both; a collection's lights follow the photo."""
+    from relit.conventions import move_points, similarity
+    from relit.scene import Mesh
+    from relit.viewer.serve import run_server
+
+    run = tmp_path / "run"
+    shutil.copytree(run_folder, run)
+    beside = asset.world_from_asset @ similarity(np.diag([-1.0, 1, -1]), [0.9, 0.1, -0.3])
+    poses = [asset.world_from_asset, beside]
+    listed = [{"label": i, "world_from_object": p.tolist(), "registered": True} for i, p in enumerate(poses)]
+    (run / "asset/instances.json").write_text(json.dumps({"instances": listed}))
+    write_linear(run / "asset/lights/photo_0001.exr", lopsided(16)[..., [2, 0, 1]])
+    server = serve(lambda: run_server(run))
+    steps = [
+        READY,
+        {"click": '[data-photo="1"]'},
+        {"wait": "relit.viewer.light.name === 'photo_0001.exr'"},
+        {"eval": "relit.viewer.own"},
+        {"click": '[data-photo="1"]'},
+        {"select": ["#light", "0"]},
+        {"wait": "relit.viewer.light.name === 'environment.exr'"},
+        {"click": "#instances"},
+        {"eval": f"relit.viewer.linear(0, {WIDTH}, {HEIGHT}, 12)"},
+    ]
+    own, values = [r for r in drive(server.url, steps) if r is not None]
+    server.shutdown()
+    server.server_close()
+    assert own is True
+    unit = [np.linalg.inv(asset.world_from_asset) @ p for p in poses]
+    m, n = asset.mesh, len(asset.mesh.vertices)
+    both = Mesh(
+        np.concatenate([move_points(p, m.vertices) for p in unit]).astype(np.float32),
+        np.concatenate([m.faces, m.faces + n]),
+        np.concatenate([m.normals @ p[:3, :3].T for p in unit]).astype(np.float32),
+        np.concatenate([m.uvs] * 2),
+    )
+    wanted = render(build_scene(both, asset.material, asset.world_from_asset, asset.environment), asset.cameras[0][1], spp=128)
+    picture = linear(values)
+    assert np.abs(picture[..., 3] - wanted[..., 3]).mean() < 0.01
+    assert psnr(np.clip(srgb_from_linear(picture[..., :3]), 0, 1), wanted) > 23
+
+
+def test_a_model_that_is_damaged(drive, built, run_folder, tmp_path):
+    from relit.viewer.serve import run_server
+
+    run = tmp_path / "run"
+    shutil.copytree(run_folder, run)
+    whole = (run / "asset/object.glb").read_bytes()
+    (run / "asset/object.glb").write_bytes(whole[: len(whole) // 2])
+    server = serve(lambda: run_server(run))
+    steps = [{"wait": "document.querySelector('#message.error')"}, {"eval": "document.getElementById('message').textContent"}]
+    (said,) = drive(server.url, steps, errors_allowed=True)
+    server.shutdown()
+    server.server_close()
+    assert "cannot show this run" in said
 
 
 def test_the_driver_reports_errors(drive, server):
