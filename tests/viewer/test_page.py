@@ -175,6 +175,27 @@ def test_photo_against_render(drive, server, tmp_path):
     assert np.abs(np.roll(photo, 12, 1) - rendered)[40:420, 60:380].mean() > 1.5 * difference.mean()
 
 
+def test_as_photographed_takes_over_exposure_and_white_balance(drive, built, reference, run_folder, tmp_path):
+    from relit.images import write_srgb
+    from relit.viewer.serve import run_server
+
+    run = tmp_path / "run"
+    shutil.copytree(run_folder, run)
+    write_srgb(run / "photos/0000.jpg", reference[..., :3] * [0.8, 0.5, 0.4])
+    server = serve(lambda: run_server(run))
+    steps = [
+        READY,
+        {"select": ["#tone", "photo"]},
+        {"click": '[data-photo="0"]'},
+        {"wait": "relit.viewer.gains.has(0)"},
+        {"eval": "relit.viewer.gains.get(0)"},
+    ]
+    (gain,) = drive(server.url, steps)
+    server.shutdown()
+    server.server_close()
+    assert np.allclose(gain, [0.8, 0.5, 0.4], rtol=0.08)
+
+
 def test_a_file_that_is_no_light(drive, server, tmp_path):
     (tmp_path / "broken.exr").write_bytes(b"v/1\x01 this is no picture")
     (tmp_path / "cat.jpg").write_bytes(b"\xff\xd8")

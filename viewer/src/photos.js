@@ -48,6 +48,9 @@ export function showPhotos(viewer, manifest, panel, lights) {
   window.addEventListener("keydown", (e) => { if (e.key === "Escape" && viewer.state.photo >= 0) choose(-1); });
   $("home").addEventListener("click", () => choose(-1));
   viewer.onLayout = place;
+  viewer.onMatch = () => {
+    if (viewer.state.photo >= 0 && viewer.state.view === "shaded" && photo.complete && photo.naturalWidth) viewer.matchPhoto(photo);
+  };
   panel.append(group("Photos",
     check("frusta", "show the cameras", false, (v) => viewer.set("frusta", v)),
     element("label", {}, "photo", slider, element("output", {}, "render")),

@@ -10,6 +10,7 @@ import { Tracer } from "./tracer.js";
 const SETTLE = 180; // ms after the last motion before path tracing begins
 const TONES = { linear: 0, photo: 1, neutral: 2 };
 const FIELD = 35; // degrees
+const MATCHED = 8; // samples after which a photo's exposure and white balance are read off
 
 const rotationOf = (m) => new THREE.Matrix3().setFromMatrix4(new THREE.Matrix4().extractRotation(m));
 
@@ -26,6 +27,7 @@ export class Viewer {
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = false;
     this.controls.addEventListener("change", () => this.moved());
+    this.gains = new Map(); // photo -> red, green, blue: its exposure and white balance against the render
     this.lastMotion = -Infinity;
     this.lastFrame = 0;
     this.onProgress = () => {};
@@ -185,11 +187,13 @@ export class Viewer {
       else if (this.redraw) this.showFast(camera);
     } else if (this.redraw) this.showFast(camera);
     this.lastFrame = now;
+    if (this.tracing && this.tracer.strip === 0 && this.tracer.count === MATCHED) this.onMatch?.();
     this.onProgress(this.tracing ? this.tracer.count : -1);
   }
 
   showTraced(target = null) {
     const s = this.tracer.showing;
+    s.gain.value.fromArray(this.gains.get(this.state.photo) ?? [1, 1, 1]);
     s.exposure.value = this.state.exposure;
     s.tone.value = TONES[this.state.tone];
     s.showLight.value = this.state.showLight && !this.flash;
@@ -241,6 +245,27 @@ export class Viewer {
       if (p.z < 1 && d < least) [best, least] = [i, d];
     });
     return best;
+  }
+
+  // Exposure and white balance of the chosen photo (an image element) against the render from its camera: what `as photographed` shows.
+  matchPhoto(image) {
+    const t = this.tracer.targets[0], w = t.width, h = t.height, mean = this.tracer.read();
+    const context = Object.assign(document.createElement("canvas"), { width: w, height: h }).getContext("2d", { willReadFrequently: true });
+    context.drawImage(image, 0, 0, w, h);
+    const codes = context.getImageData(0, 0, w, h).data, photo = [0, 0, 0], render = [0, 0, 0];
+    const linear = (c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+    const k = Math.max(1, Math.round((3 * w) / image.naturalWidth)); // off the rim, where pixels of the photo hold background as well
+    const covered = (x, y) => x >= 0 && y >= 0 && x < w && y < h && mean[4 * ((h - 1 - y) * w + x) + 3] > 0.99;
+    for (let y = 0; y < h; y++)
+      for (let x = 0; x < w; x++) {
+        const p = 4 * (y * w + x), r = 4 * ((h - 1 - y) * w + x);
+        if (!(covered(x - k, y) && covered(x + k, y) && covered(x, y - k) && covered(x, y + k) && covered(x, y)) || Math.max(codes[p], codes[p + 1], codes[p + 2]) > 250) continue; // clipped pixels say nothing
+        for (let c = 0; c < 3; c++) { photo[c] += linear(codes[p + c] / 255); render[c] += mean[r + c]; }
+      }
+    const gain = photo.map((v, c) => (render[c] > 0 && v > 0 ? Math.min(Math.max(v / render[c], 0.125), 8) : 1));
+    this.gains.set(this.state.photo, gain);
+    this.redraw = true;
+    return gain;
   }
 
   // For tests and scripts: `count` samples at width x height from a photo's camera; linear RGBA means, row 0 at the top.
