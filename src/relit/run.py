@@ -106,9 +106,9 @@ class Run:
         steps: number of steps that `Stage.step` will report, or None. title: what the reader sees (else the name).
         """
         stage = Stage(self, name, title or name, steps)
-        self.log.note(f"{stage.title}: begun" if stage.earlier == 0 else f"{stage.title}: taken up again")
         watch = MemoryWatch().start()
-        try:
+        try:  # a stop that comes right after the first note is told like any other
+            self.log.note(f"{stage.title}: begun" if stage.earlier == 0 else f"{stage.title}: taken up again")
             with disk_errors(self.folder):
                 yield stage
         except BaseException as raised:
