@@ -337,6 +337,8 @@ def test_no_libllvm_in_a_fresh_process(tmp_path, capture):
 
 @pytest.mark.parametrize("verb, flags", [
     ("export", ["-o", "x.glb"]),
+    ("export", ["-o", "x.html"]),
+    ("view", ["--no-browser"]),
     ("evaluate", ["--truth", "."]),
     ("relight", ["--light", "l.hdr", "-o", "pictures"]),
 ])  # fmt: skip
@@ -345,3 +347,18 @@ def test_verbs_that_need_an_asset(capsys, tmp_path, monkeypatch, verb, flags):
     (tmp_path / "empty").mkdir()
     got, _, err = relit(capsys, verb, "empty", *flags)
     answered(got, err, 3, "asset folder")
+
+
+def test_a_page_that_is_not_built(capsys, tmp_path, monkeypatch):
+    """A checkout without node: every other verb works, and these two say what builds it."""
+    from relit.asset.asset import save_asset
+    from relit.capture.procedural import pawn
+    from relit.scene import Asset
+
+    save_asset(tmp_path / "run/asset", Asset(*pawn(6, 8, 8), np.eye(4)))
+    monkeypatch.setattr("relit.viewer.page.PAGE", tmp_path / "nowhere.html")
+    for words in (["view", tmp_path / "run", "--no-browser"], ["export", tmp_path / "run", "-o", tmp_path / "x.html"]):
+        got, _, err = relit(capsys, *words)
+        answered(got, err, 5, "make viewer")
+    got, _, err = relit(capsys, "view", tmp_path / "run", "--port", "99999")
+    answered(got, err, 2, "no port")
