@@ -15,14 +15,14 @@ from relit.cameras.se3 import look_at
 from relit.conventions import environment_directions
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank
-from relit.fit.surface import SurfaceOptions, dual_loss, light_prior, material_prior, neighbours
+from relit.fit.surface import SurfaceOptions, dual_loss, light_prior, material_prior, neighbours, slope_prior
 from relit.geometry.sdf import make_grid, node_positions
 from relit.lighting.environment import Environment
-from relit.materials.field import material_at, start_material
+from relit.materials.field import material_at, slope_at, start_material
 from relit.rendering import background as bg
 from relit.rendering.march import march, sphere_interval
 from relit.rendering.shade import CHANNELS, COLUMNS, ROWS, shade
-from relit.rendering.transport import TraceableMesh, first_hits, reflected, sample_lights
+from relit.rendering.transport import TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 from relit.scene import Camera
 
 PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
@@ -34,6 +34,7 @@ PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
     "translations": (("matt", "saddle"), 2e-4),
     "colour": (("surface",), 1e-3),
     "metallic": (("surface",), 1e-3),
+    "slope": (("surface",), 1e-3),
     "log_light": (("surface",), 2e-3),
 }
 N, SIZE, VIEWS = 16, 10, 4
@@ -127,15 +128,18 @@ class SurfaceScene:
         camera = Camera(SIZE, SIZE, 2.0 * SIZE, 2.0 * SIZE, SIZE / 2, SIZE / 2, look_at([1.2, 1.0, 1.4]))
         batch = batch_of(make_bank([camera], [np.zeros((SIZE, SIZE, 3), np.float32)], [None]), mi.UInt32(np.arange(SIZE * SIZE)))
         self.points = first_hits(self.mesh, batch.o, batch.d)
+        self.smooth = self.points.n
         self.target = mi.Color3f(*[mi.Float(rng.uniform(0.1, 0.9, SIZE * SIZE)) for _ in range(3)])
         lanes = mi.PCG32(size=SIZE * SIZE, initstate=1)
         self.near = neighbours(self.mesh, self.points, 0.15, lanes)
+        self.close = neighbours(self.mesh, self.points, 0.05, lanes)
         colour = np.array(self.field.colour).reshape(-1, 4)
         colour[:, 3] = rng.uniform(0.3, 0.7, len(colour))
         d = environment_directions(6, 12)
         self.start = {
             "colour": colour.astype(np.float32).ravel(),
             "metallic": rng.uniform(0.1, 0.9, 64).astype(np.float32),
+            "slope": rng.uniform(-0.2, 0.2, 128).astype(np.float32),
             "log_light": (0.7 * np.sin(2 * d + [0, 1, 2])).astype(np.float32).ravel(),
         }
         x = {k: mi.Float(v) for k, v in self.start.items()}
@@ -146,8 +150,11 @@ class SurfaceScene:
         self.environment = environment
 
     def place(self, x):
-        """The material and light of the parameters."""
-        self.field.colour, self.field.metallic = x["colour"], x["metallic"]
+        """The material and light of the parameters, and their normals in the points."""
+        self.field.colour, self.field.metallic, self.field.slope = x["colour"], x["metallic"], x["slope"]
+        self.points.n = self.smooth
+        self.bend = slope_at(self.field, self.points.uv, self.points.valid)
+        self.points.n = bent_normal(self.points, self.bend)
         radiance = dr.exp(x["log_light"])
         if not hasattr(self, "environment"):
             return material_at(self.field, self.points.uv, self.points.valid), Environment(radiance, 6, 12)
@@ -159,6 +166,8 @@ class SurfaceScene:
         a, b = reflected(self.points, self.lights, surface, environment)
         fit = dual_loss(a, b, self.target, self.valid)
         prior = material_prior(self.field, surface, self.near, self.valid, self.options, mi.Float(self.options.smooth_colour))
+        bend = self.bend.x * self.points.t + self.bend.y * self.points.b
+        prior += slope_prior(self.field, bend, self.close, self.valid, self.options)
         return fit + prior + light_prior(x["log_light"], self.options)
 
 

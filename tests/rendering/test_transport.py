@@ -33,7 +33,7 @@ def scene(rough=0.4, metal=0.3):
     rng = np.random.default_rng(0)
     light = rng.uniform(0.1, 1.0, (8, 16, 3)).astype(np.float32)
     light[2, 5] = 12.0
-    field = MaterialField(2, mi.Float(np.tile([0.7, 0.4, 0.2, rough], 4)), mi.Float(np.full(4, metal, np.float32)))
+    field = MaterialField(2, mi.Float(np.tile([0.7, 0.4, 0.2, rough], 4)), mi.Float(np.full(4, metal, np.float32)), dr.zeros(mi.Float, 8))
     return field, Environment.from_image(light), light
 
 
@@ -93,7 +93,7 @@ def test_a_blocked_direction_brings_the_blocker_s_radiance():
     mesh = Mesh(np.asarray(m.vertices, np.float32), np.asarray(m.faces, np.int32), n.astype(np.float32), uvs)
     radiance = np.where(np.asarray(m.vertices)[:, 2:] > 0.05, 2.0, 0.0).repeat(3, 1)
     traceable = TraceableMesh(mesh, radiance)
-    field = MaterialField(2, mi.Float(np.tile([0.5, 0.5, 0.5, 1.0], 4)), mi.Float(np.zeros(4, np.float32)))
+    field = MaterialField(2, mi.Float(np.tile([0.5, 0.5, 0.5, 1.0], 4)), mi.Float(np.zeros(4, np.float32)), dr.zeros(mi.Float, 8))
     dark = Environment.from_image(np.full((4, 8, 3), 1e-3, np.float32))
     points = first_hits(traceable, mi.Point3f(0, 0, 0.06), mi.Vector3f(0, 0, -1))
     dr.eval(points)
@@ -138,7 +138,7 @@ def test_gradients_agree_with_finite_differences(what, step):
     def value(s):
         now = dict(before)
         now[key] = (before[key] + s * step * direction).astype(np.float32)
-        moved = MaterialField(2, mi.Float(now["colour"]), mi.Float(now["metallic"]))
+        moved = MaterialField(2, mi.Float(now["colour"]), mi.Float(now["metallic"]), field.slope)
         return float(loss_of(traceable, points, lights, target, moved, mi.Float(now["light"]), 8)[0])
 
     numeric = (value(1) - value(-1)) / (2 * step)

@@ -28,7 +28,7 @@ from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
-from relit.materials.field import pictures
+from relit.materials.field import normal_map, pictures
 from relit.materials.intrinsic import base_without_shading
 from relit.rendering.background import start_background
 from relit.rendering.shade import mean_radiance
@@ -49,8 +49,8 @@ class MultiviewOptions:
     directions per pixel. light: rows of the environment map. without: parts of the surface pass that are switched off, names of WITHOUT.
     """
 
-    levels: tuple[int, ...] = (64, 128, 256)
-    level_steps: tuple[int, ...] = (250, 350, 400)
+    levels: tuple[int, ...] = (128, 256)
+    level_steps: tuple[int, ...] = (500, 500)
     rays: int = 8192
     max_pixels: int = 24_000_000
     refine_cameras: float = 0.0
@@ -77,6 +77,8 @@ WITHOUT = {  # what an ablation switches off: settings of the surface pass
     "material_prior": {"smooth_roughness": 0.0, "smooth_metallic": 0.0, "metallic_binary": 0.0, "metallic_sparse": 0.0},
     "colour_smoothing": {"smooth_colour": 0.0},
     "light_prior": {"light_smooth": 0.0, "light_neutral": 0.0},
+    "parsimony": {"parsimony": 0.0},
+    "normal_map": {"slope_rate": 0.0},
 }
 
 PRESETS = {
@@ -95,8 +97,8 @@ PRESETS = {
     },
     "standard": {},
     "high": {
-        "levels": (64, 128, 256),
-        "level_steps": (400, 600, 800),
+        "levels": (128, 256),
+        "level_steps": (800, 1000),
         "max_pixels": 60_000_000,
         "background": 128,
         "explore_steps": 800,
@@ -305,6 +307,7 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
             "roughness": fill_gutters(roughness, known),
             "metallic": fill_gutters(metallic, known),
             "environment": model.environment.image(),
+            "normal": normal_map(model.material),
             "f0": np.array(model.material.f0),
         }
         stage.save("maps", **maps)
@@ -334,7 +337,7 @@ def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_fr
         vertices=move_points(asset_from_unit, mesh.vertices).astype(np.float32),
         normals=(mesh.normals @ rotation.T).astype(np.float32),
     )
-    material = Material(maps["base_color"], maps["roughness"], maps["metallic"])
+    material = Material(maps["base_color"], maps["roughness"], maps["metallic"], normal=maps["normal"])
     poses = [p.camera.world_from_camera for p in capture.photos] if poses is None else poses
     cameras = tuple((p.name, p.camera.with_pose(pose)) for p, pose in zip(capture.photos, poses, strict=True))
     return Asset(placed, material, world_from_asset, maps["environment"], cameras, {})

@@ -17,8 +17,8 @@ from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
 from relit.lighting.environment import Environment
-from relit.materials.field import MaterialField, material_at, project, start_material
-from relit.rendering.transport import Points, TraceableMesh, first_hits, reflected, sample_lights
+from relit.materials.field import MaterialField, material_at, project, slope_at, start_material
+from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 
 ALBEDO_START = 0.4  # mean base colour at the start; light and albedo share one unknown scale
 
@@ -32,7 +32,10 @@ class SurfaceOptions:
     `exchange_scale` (log). warm: part of the steps over which colour_rate rises from a twentieth. roughness_start: first roughness.
     smooth_roughness, smooth_metallic, smooth_colour: weights of differences between similar neighbours, up to similarity_reach (unit
     frame) apart and similarity_width in base colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. light_smooth: total
-    variation of the log radiance. light_neutral: its chroma.
+    variation of the log radiance. light_neutral: its chroma. parsimony, parsimony_width, parsimony_share: see `parsimony`.
+    slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth: weights of
+    `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise does not
+    move it at full rate.
     """
 
     steps: int = 700
@@ -56,6 +59,15 @@ class SurfaceOptions:
     metallic_sparse: float = 0.03
     light_smooth: float = 0.002
     light_neutral: float = 2e-4
+    parsimony: float = 0.02
+    parsimony_width: float = 0.1
+    parsimony_share: float = 0.0
+    slope_rate: float = 0.01
+    slope_begin: float = 0.25
+    slope_small: float = 0.02
+    slope_smooth: float = 0.05
+    slope_reach: float = 0.02
+    slope_calm: float = 1.0
 
 
 @dataclass
@@ -88,6 +100,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     if saved:
         first = int(saved["step"])
         material.colour, material.metallic = mi.Float(saved["colour"]), mi.Float(saved["metallic"])
+        material.slope = mi.Float(saved["slope"])
         model.log_light = mi.Float(saved["light"])
     environment.radiance = dr.exp(model.log_light)
     environment.rebuild()
@@ -95,6 +108,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
     adam_scale = Adam(3)
     adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, model.log_light))
+    adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
     ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
     ratio = mi.Float(ratio)
 
@@ -109,22 +123,31 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         points.valid = valid
         dr.eval(points, batch.rgb)
         near = neighbours(mesh, points, options.similarity_reach, rng)
-        dr.eval(near, rng)
+        close = neighbours(mesh, points, options.slope_reach, rng)
+        dr.eval(near, close, rng)
+        shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (count - 1))
         with dr.suspend_grad():
             start = material_at(material, points.uv, valid)
-            dr.eval(start.base, start.roughness, start.metallic)
+            smooth_n = points.n
+            points.n = bent_normal(points, slope_at(material, points.uv, valid))
+            dr.eval(start.base, start.roughness, start.metallic, points.n)
         lights = sample_lights(mesh, points, start, environment, options.directions, rng)
 
         # opaque: the weight must not become a literal
         colour_smoothing = dr.opaque(mi.Float, options.smooth_colour)
 
-        params = [material.colour, material.metallic, model.log_light]
+        params = [material.colour, material.metallic, model.log_light, material.slope]
         dr.enable_grad(*params)
         environment.radiance = dr.exp(model.log_light)
         surface = material_at(material, points.uv, valid)
+        slope = slope_at(material, points.uv, valid)
+        points.n = smooth_n
+        bend = slope.x * points.t + slope.y * points.b
+        points.n = bent_normal(points, slope)
         a, b = reflected(points, lights, surface, environment)
         fit = dual_loss(a, b, batch.rgb, valid)
         prior = material_prior(material, surface, near, valid, options, colour_smoothing) + light_prior(model.log_light, options)
+        prior += parsimony(material, surface, points.uv, valid, shift, options) + slope_prior(material, bend, close, valid, options)
         dr.backward(fit + prior)
         gradients = [dr.grad(p) for p in params]
         dr.disable_grad(*params)
@@ -132,16 +155,19 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         material.colour = adam_colour.step(dr.detach(material.colour), gradients[0], options.colour_rate * decay * warm, ratio)
         material.metallic = adam_metallic.step(dr.detach(material.metallic), gradients[1], options.metallic_rate * decay)
         model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * decay)
+        slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
+        material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
         exchange_scale(material, model, adam_scale, gradients[0], gradients[2], options.scale_rate * decay)
         project(material)
-        dr.eval(model.log_light, material.colour, material.metallic)
+        dr.eval(model.log_light, material.colour, material.metallic, material.slope)
         environment.radiance = dr.exp(model.log_light)
         dr.eval(environment.radiance)
         environment.rebuild()
         return {"colour": fit}
 
     def state() -> dict:
-        return {"colour": np.array(material.colour), "metallic": np.array(material.metallic), "light": np.array(model.log_light)}
+        names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": model.log_light}
+        return {name: np.array(value) for name, value in names.items()}
 
     run_steps(stage, first, options.steps, step, state)
     return model
@@ -199,6 +225,30 @@ def material_prior(material: MaterialField, surface, near: Points, valid, option
     m = surface.metallic
     single = options.metallic_binary * m * (1 - m) + options.metallic_sparse * m
     return dr.mean(smooth * w) + dr.mean(dr.select(valid, single, 0))
+
+
+def parsimony(material: MaterialField, surface, uv, valid, shift, options: SurfaceOptions):
+    """An object has few materials (Barron & Malik 2015, Sec. 4.2): pairs of points anywhere on it attract each other's display value of
+    base colour when they are closer than about parsimony_width, and then share roughness and metallic too. shift: opaque UInt32, how far
+    the partner of a point is in the batch."""
+    n = dr.width(uv)
+    partner = (dr.arange(mi.UInt32, n) + shift) % n
+    uv, valid = dr.gather(mi.Point2f, uv, partner), valid & dr.gather(mi.Bool, valid, partner)
+    other = material_at(material, uv, valid)
+    shown = lambda c: dr.maximum(c, 1e-3) ** (1 / 2.2)  # noqa: E731
+    alike = dr.exp(-dr.squared_norm(mi.Vector3f(shown(other.base) - shown(surface.base))) / (2 * options.parsimony_width**2))
+    share = dr.abs(other.roughness - surface.roughness) + dr.abs(other.metallic - surface.metallic)
+    value = options.parsimony_share * dr.detach(alike) * share - options.parsimony * alike
+    return dr.mean(dr.select(valid, value, 0))
+
+
+def slope_prior(material: MaterialField, bend, close: Points, valid, options: SurfaceOptions):
+    """Normal maps are small, and change little between neighbours. bend: Vector3f, slope.x t + slope.y b at the points."""
+    slope = slope_at(material, close.uv, close.valid)
+    difference = bend - (slope.x * close.t + slope.y * close.b)
+    small = options.slope_small * dr.select(valid, dr.squared_norm(bend), 0)
+    smooth = options.slope_smooth * dr.select(valid & close.valid, dr.norm(difference + 1e-5), 0)
+    return dr.mean(small + smooth)
 
 
 def light_prior(log_light, options: SurfaceOptions):

@@ -47,16 +47,16 @@ class VolumeOptions:
     levels: tuple[int, ...] = (64, 128, 192)
     steps: tuple[int, ...] = (300, 450, 350)
     rays: int = 8192
-    sdf_rate: float = 0.06
+    sdf_rate: float = 0.1
     feature_rate: float = 0.02
-    sharpness: tuple[float, float] = (1.0, 4.0)
+    sharpness: tuple[float, float] = (3.0, 8.0)
     step: float = 0.9
     eikonal: float = 0.1
     diffusion: float = 0.2
     mask: float = 0.8
     normal: float = 0.05
     band: float = 5.0
-    calm: float = 1.0
+    calm: float = 0.5
     refine_cameras: float = 0.0
 
 

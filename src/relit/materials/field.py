@@ -12,22 +12,26 @@ import numpy as np
 from relit.materials.brdf import Surface
 
 MIN_ROUGHNESS = 0.08  # brdf.MIN_ALPHA
+MAX_SLOPE = 1.0  # of a normal map: 45 degrees along each axis
 
 
 @dataclass
 class MaterialField:
-    """Square textures of `size` texels a side. colour: Float [size^2 * 4], linear base colour and roughness. metallic: Float [size^2]."""
+    """Square textures of `size` texels a side. colour: Float [size^2 * 4], linear base colour and roughness. metallic: Float [size^2].
+    slope: Float [size^2 * 2], the normal map as x / z and y / z of tangent-space normals."""
 
     size: int
     colour: Any
     metallic: Any
+    slope: Any
     f0: float = 0.04
 
 
 def start_material(size: int, base: np.ndarray, roughness: float, metallic: float, f0: float = 0.04) -> MaterialField:
     """base: (size, size, 3) linear start of the base colour."""
     colour = np.concatenate([base, np.full((size, size, 1), roughness)], -1).astype(np.float32)
-    return MaterialField(size, mi.Float(colour.ravel()), mi.Float(np.full(size * size, metallic, np.float32)), f0)
+    flat = dr.zeros(mi.Float, size * size * 2)
+    return MaterialField(size, mi.Float(colour.ravel()), mi.Float(np.full(size * size, metallic, np.float32)), flat, f0)
 
 
 def texels_at(field: MaterialField, uv):
@@ -49,13 +53,29 @@ def material_at(field: MaterialField, uv, active=True) -> Surface:
     return Surface(mi.Color3f(colour.x, colour.y, colour.z), colour.w, metallic, field.f0)
 
 
+def slope_at(field: MaterialField, uv, active=True):
+    """Bilinear look-up of the normal map's slope (Vector2f); differentiable in field.slope."""
+    slope = mi.Vector2f(0)
+    for i, w in texels_at(field, uv):
+        slope = dr.fma(dr.gather(mi.Vector2f, field.slope, i, active), w, slope)
+    return slope
+
+
 def project(field: MaterialField) -> None:
     """Clip every texel to what a material may be: colour and metallic in [0, 1], roughness in [MIN_ROUGHNESS, 1]."""
     n = dr.width(field.colour)
     low = dr.select(dr.arange(mi.UInt32, n) % 4 == 3, mi.Float(MIN_ROUGHNESS), mi.Float(0.0))
     field.colour = dr.clip(field.colour, low, 1)
     field.metallic = dr.clip(field.metallic, 0, 1)
-    dr.schedule(field.colour, field.metallic)
+    field.slope = dr.clip(field.slope, -MAX_SLOPE, MAX_SLOPE)
+    dr.schedule(field.colour, field.metallic, field.slope)
+
+
+def normal_map(field: MaterialField) -> np.ndarray:
+    """(S, S, 3) float32 unit tangent-space normals, x along the tangent, y up in the texture."""
+    slope = np.array(field.slope).reshape(field.size, field.size, 2)
+    n = np.concatenate([slope, np.ones_like(slope[..., :1])], -1)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
 
 def pictures(field: MaterialField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

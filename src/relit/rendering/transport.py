@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.geometry.tangents import vertex_tangents
 from relit.lighting.environment import Environment
 from relit.materials.brdf import Surface, evaluate, pdf, sample
 from relit.rendering.mitsuba_scene import build_geometry
@@ -33,13 +34,15 @@ class TraceableMesh:
         self.origins = SmoothOrigins(mesh)
         self.faces, self.normals = self.origins.faces, self.origins.normals
         self.uvs = mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel())
+        self.tangents = mi.Float(vertex_tangents(mesh).ravel())
         self.radiance = mi.Float(np.ascontiguousarray(radiance, np.float32).ravel())
 
 
 @dataclass
 class Points:
     """Surface points seen along rays. valid: Bool. x: Point3f on the smooth surface. n: Vector3f unit shading normal. geometric: Vector3f.
-    v: Vector3f to the viewer. uv: Point2f, v = 0 at the top row of textures."""
+    v: Vector3f to the viewer. uv: Point2f, v = 0 at the top row of textures. t, b: Vector3f unit tangent and bitangent of normal maps,
+    orthogonal to the interpolated normal (glTF 2.0, Sec. 3.9.3)."""
 
     valid: Any
     x: Any
@@ -47,6 +50,8 @@ class Points:
     geometric: Any
     v: Any
     uv: Any
+    t: Any
+    b: Any
 
 
 def first_hits(mesh: TraceableMesh, o, d) -> Points:
@@ -62,7 +67,19 @@ def first_hits(mesh: TraceableMesh, o, d) -> Points:
         n = dr.select(hit, dr.normalize(n), mi.Vector3f(0, 0, 1))  # a miss must not become a NaN that meets a zero weight
         uv = dr.select(hit, sum(b[k] * dr.gather(mi.Point2f, mesh.uvs, corner[k], hit) for k in range(3)), 0)
         x = dr.select(hit, mi.Point3f(mesh.origins.shifted(si, pi.prim_uv, hit)), 0)
-        return Points(hit & (dr.dot(si.n, d) < 0), x, n, dr.select(hit, mi.Vector3f(si.n), mi.Vector3f(0, 0, 1)), -mi.Vector3f(d), uv)
+        t = sum(b[k] * dr.gather(mi.Vector4f, mesh.tangents, corner[k], hit) for k in range(3))
+        along = mi.Vector3f(t.x, t.y, t.z)
+        along = along - n * dr.dot(n, along)
+        length = dr.norm(along)
+        along = dr.select(hit & (length > 1e-6), along / dr.maximum(length, 1e-6), mi.Frame3f(n).s)
+        across = dr.select(t.w < 0, -1.0, 1.0) * dr.cross(n, along)
+        geometric = dr.select(hit, mi.Vector3f(si.n), mi.Vector3f(0, 0, 1))
+        return Points(hit & (dr.dot(si.n, d) < 0), x, n, geometric, -mi.Vector3f(d), uv, along, across)
+
+
+def bent_normal(points: Points, slope):
+    """The normal of a normal map, n + slope.x t + slope.y b made unit (Vector3f); differentiable in slope (Point2f or Vector2f)."""
+    return dr.normalize(points.n + slope.x * points.t + slope.y * points.b)
 
 
 @dataclass
@@ -139,11 +156,11 @@ def surface_at(surface: Surface, point) -> Surface:
 def reflected(points: Points, lights: Lights, surface: Surface, environment: Environment):
     """Radiance towards the viewer (two Color3f, estimated from the even and from the odd directions of each point).
 
-    Differentiable in the surface's material and in environment.radiance. The product of the two residuals is an unbiased estimate of the
-    squared error; the square of one estimate would pull towards materials with less noise.
+    Differentiable in the surface's material, in points.n and in environment.radiance. The product of the two residuals is an unbiased
+    estimate of the squared error; the square of one estimate would pull towards materials with less noise.
     """
     point = lights.point
-    n, v = dr.gather(mi.Vector3f, points.n, point), dr.gather(mi.Vector3f, points.v, point)
+    n, v = repeat(points.n, lights.count), dr.gather(mi.Vector3f, points.v, point)
     m = Surface(*[repeat(c, lights.count) for c in (surface.base, surface.roughness, surface.metallic)], surface.f0)
     arriving = environment.eval(lights.l) * lights.visible + lights.blocked
     value = evaluate(m, n, v, lights.l) * arriving * (2 * lights.weight)
