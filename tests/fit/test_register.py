@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+
+from relit.cameras.se3 import exp_so3, look_at, rotation_angle
+from relit.geometry.sdf import node_positions
+from relit.scene import Camera
+
+mi = pytest.importorskip("mitsuba")
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A lump with three arms of different lengths and a colour that changes all over it."""
+    from relit.device import use_device
+
+    use_device("cpu")
+    from relit.fit.volume import start_model
+
+    n = 40
+    p = node_positions(n)
+    x, y, z = np.moveaxis(p, -1, 0)
+    body = np.sqrt(x**2 + (1.3 * y) ** 2 + (1.6 * z) ** 2) - 0.4
+
+    def arm(tip, radius):
+        tip = np.array(tip)
+        t = np.clip((p @ tip) / (tip @ tip), 0, 1)
+        return np.linalg.norm(p - t[..., None] * tip, axis=-1) - radius
+
+    values = np.minimum.reduce([body, arm([0.7, 0.2, 0], 0.1), arm([-0.1, 0.6, 0.2], 0.13), arm([0, -0.2, 0.65], 0.08)])
+    model = start_model(values.astype(np.float32), np.array([0.3, 0.3, 0.3]), None, full=True)
+    colours = np.stack([0.3 + 0.25 * np.sin(4 * x + 1), 0.3 + 0.25 * np.sin(5 * y), 0.3 + 0.25 * np.sin(4 * z - x), 0 * x], -1)
+    model.grid.features = mi.Float(np.concatenate([np.zeros((1, 4)), colours.reshape(-1, 4)]).astype(np.float32).ravel())
+    model.inv_s = 3.0 / model.grid.h
+    return model
+
+
+def photos_of(model, count, rng):
+    """Photos from anywhere, off the middle, any turn, any exposure and white: (rgb, mask, camera), with the true pose in the camera."""
+    from relit.fit.register import volume_render
+
+    out = []
+    for _ in range(count):
+        d = rng.normal(size=3)
+        pose = look_at(d / np.linalg.norm(d) * 3.5, roll=rng.uniform(-np.pi, np.pi))
+        pose[:3, :3] = pose[:3, :3] @ exp_so3(rng.uniform(-0.15, 0.15, 3))
+        camera = Camera(120, 120, 150.0, 150.0, 60.0, 60.0, pose)
+        rgb, alpha = (a[0] for a in volume_render(model)([camera]))
+        out.append((rgb * rng.uniform(0.5, 2, 3).astype(np.float32), alpha, camera))
+    return out
+
+
+def errors(poses, photos):
+    return np.array([rotation_angle(p[:3, :3].T @ c.world_from_camera[:3, :3]) for p, (_, _, c) in zip(poses, photos, strict=True)])
+
+
+def test_photos_are_found_and_refined(model):
+    from relit.fit.register import crop_photo, directions_around, make_gallery, refine, search, views_from, volume_render
+
+    photos = photos_of(model, 8, np.random.default_rng(1))
+    crops = [crop_photo(*p) for p in photos]
+    render = volume_render(model)
+    found = search(crops, make_gallery(render, views_from(directions_around(300))), keep=3)
+    assert (np.diff(found.scores, axis=1) <= 0).all()
+    first = errors(found.poses[:, 0], photos)
+    assert np.median(first) < 9 and (first < 20).mean() >= 0.8
+    poses, scores = refine(crops, found.poses[:, 0], render)
+    right = first < 20
+    assert errors(poses, photos)[right].max() < 2.0
+    assert (scores[right] > 0.97).all()
+    centres = np.array([np.linalg.norm(p[:3, 3] - c.centre) for p, (_, _, c) in zip(poses, photos, strict=True)])
+    assert centres[right].max() < 0.12  # of 3.5: the distance comes from the size of the silhouette
+
+
+def test_unknown_pixels_do_not_mislead(model):
+    from relit.fit.register import crop_photo, refine, volume_render
+
+    rgb, mask, camera = photos_of(model, 1, np.random.default_rng(5))[0]
+    weight = np.ones_like(mask)
+    weight[:, 70:] = 0  # something stands before a part of the object
+    hidden = np.where(weight > 0, mask, 0)
+    start = np.array(camera.world_from_camera)
+    start[:3] = exp_so3(np.array([0.0, 0.1, 0.1])) @ start[:3]
+    crops = [crop_photo(rgb * weight[..., None], hidden, camera, weight)]
+    pose, _ = refine(crops, start[None], volume_render(model))
+    blind, _ = refine([crop_photo(rgb * weight[..., None], hidden, camera)], start[None], volume_render(model))
+    photo = [(rgb, mask, camera)]
+    assert errors(pose, photo)[0] < 3.0
+    assert errors(pose, photo)[0] < errors(blind, photo)[0]
+
+
+def test_the_search_can_be_restricted(model):
+    from relit.fit.register import crop_photo, directions_around, make_gallery, near, search, views_from, volume_render
+
+    photos = photos_of(model, 2, np.random.default_rng(3))
+    crops = [crop_photo(*p) for p in photos]
+    gallery = make_gallery(volume_render(model), views_from(directions_around(150)))
+    away = np.array([-c.centre / np.linalg.norm(c.centre) for _, _, c in photos])
+    found = search(crops, gallery, keep=2, allowed=near(gallery, away, 50))
+    for i in range(2):
+        for pose in found.poses[i]:
+            assert pose[:3, 3] @ away[i] / np.linalg.norm(pose[:3, 3]) > np.cos(np.radians(58))
+    upright = search(crops, gallery, keep=1, max_roll=np.radians(15))
+    assert upright.scores[0, 0] < search(crops, gallery, keep=1).scores[0, 0] + 1e-6
+
+
+def test_an_empty_mask_is_refused():
+    from relit.fit.register import crop_photo
+
+    with pytest.raises(ValueError, match="empty"):
+        crop_photo(np.zeros((20, 20, 3)), np.zeros((20, 20)), Camera(20, 20, 20, 20, 10, 10, np.eye(4)))
