@@ -66,12 +66,14 @@ class Pixels:
     rgb: (H, W, 3) float32 linear Rec.709. mask: (H, W) float32 in [0, 1], 1 on the object, or None when not known.
     normal: (H, W, 3) float32 unit normals in OpenCV camera axes (a prior read from a file), or None.
     clipped: (H, W) bool, True where the file's code value was saturated, or None.
+    labels: (H, W) int32, number of the object at each pixel of a photo of duplicates, 0 where there is none, or None.
     """
 
     rgb: np.ndarray
     mask: np.ndarray | None = None
     normal: np.ndarray | None = None
     clipped: np.ndarray | None = None
+    labels: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,35 @@ class Flash:
 
 
 @dataclass(frozen=True)
+class Instance:
+    """One of the identical objects in a photo of duplicates.
+
+    label: its number in the label image. world_from_object: (4, 4) similarity from the asset frame, None where it was not registered.
+    reason: why not.
+    """
+
+    label: int
+    world_from_object: np.ndarray | None
+    reason: str = ""
+
+    @property
+    def registered(self) -> bool:
+        return self.world_from_object is not None
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane that objects stand on: a square of half width `radius` around `point` (3,), unit `normal` (3,) up, in world units.
+    colour: (3,) linear base colour. roughness: perceptual."""
+
+    point: np.ndarray
+    normal: np.ndarray
+    radius: float
+    colour: np.ndarray
+    roughness: float = 0.8
+
+
+@dataclass(frozen=True)
 class Asset:
     """A relightable object: what `RUN/asset` holds.
 
@@ -187,7 +218,8 @@ class Asset:
     world_from_asset: (4, 4) similarity from the asset frame to the frame of `cameras` and `environment`.
     environment: (H, W, 3) float32 lat-long radiance in the world frame (Mitsuba's axes), or None.
     cameras: (name, Camera) pairs in the world frame. meta: what goes to asset.json besides.
-    flash: the light at the cameras of a flash capture, or None.
+    flash: the light at the cameras of a flash capture, or None. instances, ground: of a photo of duplicates; world_from_asset is the pose of
+    one of the instances then.
     """
 
     mesh: Mesh
@@ -197,3 +229,5 @@ class Asset:
     cameras: tuple[tuple[str, Camera], ...] = ()
     meta: dict = field(default_factory=dict)
     flash: Flash | None = None
+    instances: tuple[Instance, ...] = ()
+    ground: Ground | None = None

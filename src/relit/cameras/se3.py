@@ -79,6 +79,17 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
+def rotation_from(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The shortest rotation (3, 3) that carries the direction a (3,) to the direction b (3,)."""
+    a, b = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (a, b))
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if cosine < -0.999999:  # half a turn about any axis at right angles to a
+        side = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
+        return 2 * np.outer(side, side) / (side @ side) - np.eye(3)
+    k = hat(axis)
+    return np.eye(3) + k + k @ k / (1 + cosine)
+
+
 def umeyama(points_a: np.ndarray, points_b: np.ndarray, with_scale: bool = True) -> np.ndarray:
     """Least-squares similarity (4, 4) b_from_a of paired points (N, 3). Umeyama 1991, Eqs. (40)-(42)."""
     a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
