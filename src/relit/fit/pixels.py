@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -20,7 +20,8 @@ CAMERA_FLOATS = 16  # fx fy cx cy, then the 3x4 pose row by row
 class PixelBank:
     """views, total: counts of photos and pixels. rgbm: Float [total * 4], linear RGB and mask. normals: Float [total * 4] or None
     (camera axes, last entry 1 where known). cameras: Float [views * 16]. offsets, widths: UInt32 [views]. candidates: UInt32, the
-    pixels that batches are drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector, translation)."""
+    pixels that batches are drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector, translation) or
+    [views * 7] (and the log of a factor on the focal lengths)."""
 
     views: int
     total: int
@@ -108,13 +109,18 @@ def rays_through(cameras, view, x, y, corrections=None):
     """Rays (o, d) through pixel positions x, y (Floats in pixels, centres at +.5) of `view`; differentiable in `corrections`.
 
     A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by the translation, both in the unit frame.
+    Where corrections have a seventh number a view, it is the logarithm of a factor on the focal lengths.
     """
     k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
+    each = 6 if corrections is None else dr.width(corrections) * CAMERA_FLOATS // dr.width(cameras)
+    if each == 7:
+        zoom = dr.exp(-dr.gather(mi.Float, corrections, view * 7 + 6))
+        lx, ly = lx * zoom, ly * zoom
     d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
     o = mi.Vector3f(k[1].w, k[2].w, k[3].w)
     if corrections is not None:
-        c = [dr.gather(mi.Float, corrections, view * 6 + j) for j in range(6)]
+        c = [dr.gather(mi.Float, corrections, view * each + j) for j in range(6)]
         w = mi.Vector3f(c[0], c[1], c[2])
         theta2 = dr.squared_norm(w)  # Rodrigues' formula by its series, right to 1e-6 for corrections below half a radian
         turned = dr.cross(w, d)
@@ -124,13 +130,14 @@ def rays_through(cameras, view, x, y, corrections=None):
 
 
 def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
-    """The cameras with their corrections, (views * 6), built in."""
+    """The cameras with their corrections, (views * 6) or (views * 7), built in."""
     out = []
-    for camera, c in zip(cameras, np.asarray(corrections, np.float64).reshape(-1, 6), strict=True):
+    for camera, c in zip(cameras, np.asarray(corrections, np.float64).reshape(len(cameras), -1), strict=True):
         pose = np.array(camera.world_from_camera, np.float64)
         pose[:3, :3] = exp_so3(c[:3]) @ pose[:3, :3]
-        pose[:3, 3] += c[3:]
-        out.append(camera.with_pose(pose))
+        pose[:3, 3] += c[3:6]
+        zoom = float(np.exp(c[6])) if len(c) > 6 else 1.0
+        out.append(replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom, world_from_camera=pose))
     return out
 
 

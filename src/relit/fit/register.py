@@ -35,7 +35,7 @@ SIDE = 64  # pixels of crops and renderings
 REACH = 2.4  # half the side of a crop, in spreads of the silhouette (a disc's edge lies at 1.41, a rod's at 1.73)
 RINGS, TURNS = 18, 72
 RING_REACH = 2.1  # outermost ring, in spreads
-PARTS = (0.6, 2.0, 0.1)  # weights of silhouette, chromaticity and log luminance
+PARTS = (0.6, 2.0, 0.15)  # weights of silhouette, chromaticity and log luminance
 AHEAD = np.array([0.0, 0.0, 1.0])  # the optical axis in a camera's own axes
 CHUNK = 1 << 20  # rays that are rendered at a time
 
@@ -170,18 +170,18 @@ def views_from(directions: np.ndarray, distance: float = 3.0, side: int = SIDE) 
     return [Camera(side, side, focal, focal, side / 2, side / 2, look_at(d * distance)) for d in directions]
 
 
-def make_gallery(render: Render, cameras: list[Camera]) -> Gallery:
+def make_gallery(render: Render, cameras: list[Camera], parts=PARTS) -> Gallery:
     """Render the views. Views that see next to nothing never match."""
     rgb, alpha = render(cameras)
-    return Gallery(cameras, rings_of(rgb, alpha))
+    return Gallery(cameras, rings_of(rgb, alpha, parts=parts))
 
 
 # ---------------------------------------------------------------- what is compared
 
 
-def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None, centre=None, spread=None) -> Rings:
+def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None, centre=None, spread=None, parts=PARTS) -> Rings:
     """Descriptors of pictures: rgb (N, S, S, 3) linear (premultiplied or not), mask (N, S, S), weight (N, S, S) or None.
-    centre (N, 2), spread (N,): pixels, by default those of mask * weight."""
+    centre (N, 2), spread (N,): pixels, by default those of mask * weight. parts: weights as PARTS."""
     mask = np.asarray(mask, np.float32)
     known = mask if weight is None else mask * weight
     if centre is None:
@@ -210,7 +210,7 @@ def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None
     bright = (bright - mean[:, None, None]) * (a > 0.5)
     deviation = np.sqrt((bright**2 * inside).sum((1, 2)) / total)
     bright = np.clip(bright / (deviation[:, None, None] + 0.02), -2.5, 2.5)
-    f = np.concatenate([PARTS[0] * a[..., None], PARTS[1] * chroma, PARTS[2] * bright[..., None]], -1)  # (N, RINGS, TURNS, 5)
+    f = np.concatenate([parts[0] * a[..., None], parts[1] * chroma, parts[2] * bright[..., None]], -1)  # (N, RINGS, TURNS, 5)
     weighted = f * area[..., None]
 
     def spectrum(g):
@@ -301,9 +301,9 @@ def crop_views(crops: list[Crop], poses: np.ndarray) -> list[Camera]:
 # ---------------------------------------------------------------- search and refinement
 
 
-def crop_rings(crops: list[Crop]) -> Rings:
+def crop_rings(crops: list[Crop], parts=PARTS) -> Rings:
     """What is compared of the crops; compute once, they do not change."""
-    return rings_of(*(np.stack([getattr(c, name) for c in crops]) for name in ("rgb", "mask", "weight")))
+    return rings_of(*(np.stack([getattr(c, name) for c in crops]) for name in ("rgb", "mask", "weight")), parts=parts)
 
 
 def search(
@@ -313,13 +313,15 @@ def search(
     *,
     rings: Rings | None = None,
     allowed: np.ndarray | None = None,
+    prior: np.ndarray | None = None,
     max_roll: float | None = None,
     apart: float = 20.0,
 ) -> Hypotheses:
     """The `keep` best poses of each crop, at least `apart` degrees from each other.
 
-    rings: of the crops, where they are at hand. allowed: (P, V) bool, viewpoints that may be taken (see `near`). max_roll: radians of turn
-    against a picture in which +y of the model is up, or None for all.
+    rings: of the crops, where they are at hand. allowed: (P, V) bool, viewpoints that may be taken (see `near`). prior: (P, V) or
+    (P, V, TURNS), added to the scores that decide (not to those that are returned). max_roll: radians of turn against a picture in which +y
+    of the model is up, or None for all.
     """
     rings = crop_rings(crops) if rings is None else rings
     scores = all_scores(rings, gallery.rings)
@@ -327,13 +329,14 @@ def search(
     p = len(crops)
     poses, best, view = np.tile(np.eye(4), (p, keep, 1, 1)), np.full((p, keep), -1.0), np.zeros((p, keep), int)
     for i, crop in enumerate(crops):
-        shift = np.where(upright, scores[i], -1).argmax(1)
-        height = scores[i][np.arange(len(shift)), shift]
+        judged = scores[i] if prior is None else scores[i] + (prior[i] if prior.ndim == 3 else prior[i][:, None])
+        shift = np.where(upright, judged, -1).argmax(1)
+        height = judged[np.arange(len(shift)), shift]
         if allowed is not None:
-            height[~allowed[i]] = -1
+            height[~allowed[i]] = -np.inf
         kept = 0
         for v in np.argsort(-height):
-            if kept == keep or height[v] <= -1:
+            if kept == keep or height[v] == -np.inf:
                 break
             at, top = _peak(scores[i, v : v + 1], shift[v : v + 1])
             g = gallery.rings
@@ -353,8 +356,24 @@ def near(gallery: Gallery, directions: np.ndarray, degrees: float) -> np.ndarray
     return np.asarray(directions) @ seen.T >= np.cos(np.radians(degrees))
 
 
+def hint_prior(gallery: Gallery, directions: np.ndarray, degrees: float, roll: float) -> np.ndarray:
+    """(P, V, TURNS): -(angle / degrees)^2 - (turn / roll)^2 for the angle between each view and each of `directions` (P, 3), unit, and
+    the turn against upright; all in degrees."""
+    seen = np.array([c.centre / np.linalg.norm(c.centre) for c in gallery.cameras])
+    angle = np.degrees(np.arccos(np.clip(np.asarray(directions) @ seen.T, -1, 1)))
+    turn = np.degrees(turn_angles(np.arange(TURNS)))
+    return -((angle / degrees)[..., None] ** 2) - (turn / roll) ** 2
+
+
 def refine(
-    crops: list[Crop], poses: np.ndarray, render: Render, *, rings: Rings | None = None, steps=(0, 0, 6.0, 3.0, 1.5, 0.75), turn=12.0
+    crops: list[Crop],
+    poses: np.ndarray,
+    render: Render,
+    *,
+    rings: Rings | None = None,
+    steps=(0, 0, 6.0, 3.0, 1.5, 0.75),
+    turn=12.0,
+    parts=PARTS,
 ):
     """Better poses (P, 4, 4) and their scores (P,): in each round the model is rendered, through each crop's own camera, from the present
     viewpoint and six around it at steps[i] degrees; the best takes its place, with turn, shift and distance from the match.
@@ -362,7 +381,7 @@ def refine(
     turn: degrees of in-plane turn that one round may make. Unknown pixels are left out of the silhouettes of both; rounds of step 0, which
     only put turn, shift and distance right, let the part that is seen settle first.
     """
-    rings = crop_rings(crops) if rings is None else rings
+    rings = crop_rings(crops, parts) if rings is None else rings
     poses, best = np.array(poses, np.float64), np.full(len(crops), -1.0)
     weight = np.stack([c.weight for c in crops])
     reach = np.abs(turn_angles(np.arange(TURNS))) <= np.radians(turn) + 1e-6
@@ -375,7 +394,7 @@ def refine(
         cameras = crop_views([crops[i] for i in photo], tilted)
         rgb, alpha = render(cameras)
         centre, spread = moments(alpha * weight[photo])
-        views = rings_of(rgb, alpha, weight[photo], centre, spread)
+        views = rings_of(rgb, alpha, weight[photo], centre, spread, parts)
         scores = pair_scores(rings, views, photo)
         shift = np.where(reach, scores, -1).argmax(1)
         at, top = _peak(scores, shift)
