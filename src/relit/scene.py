@@ -219,7 +219,7 @@ class Asset:
     environment: (H, W, 3) float32 lat-long radiance in the world frame (Mitsuba's axes), or None.
     cameras: (name, Camera) pairs in the world frame. meta: what goes to asset.json besides.
     flash: the light at the cameras of a flash capture, or None. instances, ground: of a photo of duplicates; world_from_asset is the pose of
-    one of the instances then.
+    one of the instances then. lights: of a collection: one environment (H, W, 3) for each of `cameras`, with the photo's exposure in it.
     """
 
     mesh: Mesh
@@ -231,3 +231,4 @@ class Asset:
     flash: Flash | None = None
     instances: tuple[Instance, ...] = ()
     ground: Ground | None = None
+    lights: tuple[np.ndarray, ...] = ()
