@@ -109,7 +109,8 @@ def rays_through(cameras, view, x, y, corrections=None):
     """Rays (o, d) through pixel positions x, y (Floats in pixels, centres at +.5) of `view`; differentiable in `corrections`.
 
     A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by the translation, both in the unit frame.
-    Where corrections have a seventh number a view, it is the logarithm of a factor on the focal lengths.
+    Where corrections have seven numbers a view, the camera turns about the ORIGIN of the unit frame (a viewpoint that is wrong is put right
+    without moving the picture), then moves, and the seventh is the logarithm of a factor on the focal lengths.
     """
     k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
@@ -123,9 +124,12 @@ def rays_through(cameras, view, x, y, corrections=None):
         c = [dr.gather(mi.Float, corrections, view * each + j) for j in range(6)]
         w = mi.Vector3f(c[0], c[1], c[2])
         theta2 = dr.squared_norm(w)  # Rodrigues' formula by its series, right to 1e-6 for corrections below half a radian
-        turned = dr.cross(w, d)
-        d = d + (1 - theta2 / 6 * (1 - theta2 / 20)) * turned + (0.5 - theta2 / 24 * (1 - theta2 / 30)) * dr.cross(w, turned)
-        o = o + mi.Vector3f(c[3], c[4], c[5])
+
+        def turn(v):
+            turned = dr.cross(w, v)
+            return v + (1 - theta2 / 6 * (1 - theta2 / 20)) * turned + (0.5 - theta2 / 24 * (1 - theta2 / 30)) * dr.cross(w, turned)
+
+        d, o = turn(d), (turn(o) if each == 7 else o) + mi.Vector3f(c[3], c[4], c[5])
     return o, d
 
 
@@ -134,9 +138,11 @@ def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
     out = []
     for camera, c in zip(cameras, np.asarray(corrections, np.float64).reshape(len(cameras), -1), strict=True):
         pose = np.array(camera.world_from_camera, np.float64)
-        pose[:3, :3] = exp_so3(c[:3]) @ pose[:3, :3]
+        turn, zoom = exp_so3(c[:3]), 1.0
+        pose[:3, :3] = turn @ pose[:3, :3]
+        if len(c) == 7:
+            pose[:3, 3], zoom = turn @ pose[:3, 3], float(np.exp(c[6]))
         pose[:3, 3] += c[3:6]
-        zoom = float(np.exp(c[6])) if len(c) > 6 else 1.0
         out.append(replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom, world_from_camera=pose))
     return out
 

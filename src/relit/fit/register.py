@@ -25,10 +25,9 @@ from scipy.ndimage import map_coordinates
 
 from relit.cameras.se3 import exp_so3, look_at, rotation_angle, rotation_from
 from relit.conventions import similarity
-from relit.fit.pixels import camera_rows, rays_through
+from relit.fit.pixels import RayBatch, camera_rows, rays_through
 from relit.fit.volume import VolumeModel
 from relit.rendering.march import march, sphere_interval
-from relit.rendering.shade import shade
 from relit.scene import Camera
 
 SIDE = 64  # pixels of crops and renderings
@@ -140,11 +139,12 @@ def volume_render(model: VolumeModel, step: float = 0.9) -> Render:
             index = dr.arange(mi.UInt32, len(some) * side * side)
             pixel = index % (side * side)
             x, y = mi.Float(pixel % side) + 0.5, mi.Float(pixel // side) + 0.5
-            o, d = rays_through(mi.Float(camera_rows(some)), index // (side * side), x, y)
+            rows = mi.Float(camera_rows(some))
+            o, d = rays_through(rows, index // (side * side), x, y)
             t0, t1 = sphere_interval(o, d)
             dr.eval(o, d, t0, t1)
             m = march(model.grid, o, d, t0, t1, inv_s, dt)
-            colour, _ = shade(m, d, model.reflections)
+            colour, _ = model.shade(m, RayBatch(o, d, None, None, index // (side * side), pixel), rows)
             inside = t1 > t0
             colour, opacity = dr.select(inside, colour, 0), dr.select(inside, m.opacity, 0)
             dr.eval(colour, opacity)

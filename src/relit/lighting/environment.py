@@ -20,9 +20,9 @@ def latlong_uv(d):
     return u - dr.floor(dr.detach(u)), dr.safe_acos(d.y) * dr.inv_pi
 
 
-def lookup_latlong(texels, height: int, width: int, d, active=True):
+def lookup_latlong(texels, height: int, width: int, d, active=True, first=0):
     """Bilinear look-up of a lat-long Float [height * width * 3] in unit directions d -> Color3f. Wraps in u, clamps in v.
-    Differentiable in `texels` and in `d` (except at the poles, where the gradient in d is zero)."""
+    Differentiable in `texels` and in `d` (except at the poles, where the gradient in d is zero). first: texel where the map begins."""
     polar = dr.square(d.x) + dr.square(d.z) < 1e-10
     d = dr.select(polar, mi.Vector3f(0, dr.detach(d.y), -1e-6), d)
     u, v = latlong_uv(d)
@@ -32,7 +32,7 @@ def lookup_latlong(texels, height: int, width: int, d, active=True):
     left = mi.UInt32(mi.Int32(x0) + width) % width
     right, top = (left + 1) % width, mi.UInt32(y0) * width
     below = top + (width if height > 1 else 0)
-    g = lambda k: dr.gather(mi.Color3f, texels, k, active)  # noqa: E731
+    g = lambda k: dr.gather(mi.Color3f, texels, k + first, active)  # noqa: E731
     return dr.lerp(dr.lerp(g(top + left), g(top + right), fx), dr.lerp(g(below + left), g(below + right), fx), fy)
 
 

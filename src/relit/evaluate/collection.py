@@ -1,0 +1,137 @@
+"""What is measured on the asset of a collection: recovered cameras after Procrustes, held-out photos from their own fitted camera and
+light, material and shape in the true test views.
+
+The truth is the folder that `relit synthesize collection` wrote. Pictures are rendered by the package's path tracer.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from relit.cameras.se3 import align_cameras as align_poses
+from relit.cameras.se3 import camera_errors
+from relit.conventions import move_pose
+from relit.errors import UserError
+from relit.evaluate import metrics as m
+from relit.evaluate.protocols import Truth, camera_key, chamfer_figures, entry, fixed_albedo_scale, material_figures
+from relit.scene import Asset, Camera
+
+WITHIN = 10.0  # degrees
+_POSE = (
+    "after the best similarity between recovered and true training cameras (Procrustes, without those more than 3 medians off)"
+)
+_HELD = "held-out photos from the camera and under the light that were fitted to them with shape and material frozen"
+DEFINITIONS = {
+    "rotation_mean": ("degrees", f"mean rotation error of the training cameras, {_POSE}"),
+    "rotation_median": ("degrees", f"median rotation error of the training cameras, {_POSE}"),
+    "rotation_within_10": ("%", f"share of training cameras whose rotation error is below {WITHIN:g} degrees, {_POSE}"),
+    "translation_percent": ("%", f"mean distance of the camera centres, in per cent of the mean distance from the object, {_POSE}"),
+    "focal_percent": ("%", "mean error of the focal lengths of the training cameras"),
+    "held_out_rotation": ("degrees", f"mean rotation error of the held-out cameras, {_POSE}"),
+    "novel_psnr": ("dB", f"{_HELD}: PSNR of sRGB pictures composite on white, each by its own coverage, whole frame (Neural-PIL, SAMURAI)"),
+    "novel_ssim": ("", f"{_HELD}: SSIM (11 x 11, sigma 1.5), composite on white, whole frame"),
+    "novel_psnr_masked": ("dB", f"{_HELD}: PSNR of sRGB pictures over pixels with true coverage >= {m.MASK}"),
+    "novel_mask_iou": ("", f"{_HELD}: intersection over union of the coverages, both >= .5"),
+}
+
+
+def load_collection_truth(folder: str | Path) -> Truth:
+    """The truth of a synthetic collection as `protocols.Truth`. Raises UserError where it is not complete."""
+    from relit.asset.asset import read_cameras
+
+    folder = Path(folder)
+    file = folder / "truth" / "truth.json"
+    if not file.is_file():
+        raise UserError("the folder holds no complete truth", fix=f"make one with `relit synthesize collection`: {folder}")
+    meta = json.loads(file.read_text())
+    cameras = {camera_key(name): camera for name, camera in read_cameras(folder / "truth" / "cameras.json")}
+    train, test = ({n: cameras[n] for n in meta[split]} for split in ("train", "test"))
+    return Truth(folder, train, test, float(meta["sphere"]["radius"]), meta)
+
+
+def evaluate_collection(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
+    """Every figure of the module. Call `relit.device.use_device` first. Returns as `protocols.evaluate`."""
+    from relit.asset.asset import load_asset
+
+    truth, asset = load_collection_truth(truth_folder), load_asset(run_or_asset)
+    return evaluate_asset(asset, truth, spp=spp, seed=seed)
+
+
+def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
+    """As `evaluate_collection`, for an asset in memory."""
+    from relit.rendering.mitsuba_scene import build_scene
+
+    found = {camera_key(name): (camera, light) for (name, camera), light in zip(asset.cameras, asset.lights, strict=True)}
+    values, world_from_found, per_view = pose_figures({n: c for n, (c, _) in found.items()}, truth)
+    for i, name in enumerate(n for n in truth.test if n in found):
+        per_view.setdefault(name, {}).update(picture_figures(asset, *found[name], truth.picture(f"test/{name}"), spp, seed + i))
+    placed = replace(asset, world_from_asset=world_from_found @ asset.world_from_asset)
+    scene = build_scene(placed.mesh, placed.material, placed.world_from_asset, np.ones((8, 16, 3), np.float32))
+    scale = fixed_albedo_scale(scene, truth)
+    for name, camera in truth.test.items():
+        per_view.setdefault(name, {}).update(material_figures(scene, camera, truth, name, scale))
+    for key in sorted({k for figures in per_view.values() for k in figures}):
+        values[key] = float(np.mean([figures[key] for figures in per_view.values() if key in figures]))
+    values.update(chamfer_figures(placed.mesh, placed.world_from_asset, truth))
+    metrics: dict[str, Any] = {}
+    for name, value in values.items():
+        if name in DEFINITIONS:
+            unit, definition = DEFINITIONS[name]
+            metrics[name] = {"value": float(value), "unit": unit, "definition": definition}
+        else:
+            metrics.update(entry(name, value))
+    return {"metrics": metrics, "per_view": per_view, "albedo_scale": [float(x) for x in scale], "alignment": "sim3"}
+
+
+def pose_figures(found: dict[str, Camera], truth: Truth) -> tuple[dict[str, float], np.ndarray, dict[str, dict[str, float]]]:
+    """(figures, world_from_found (4, 4), per held-out view figures)."""
+    names = [n for n in truth.train if n in found]
+    if len(names) < 3:
+        raise UserError("fewer than 3 recovered cameras have the name of a true one", "the asset was made from other photos")
+    a = np.array([found[n].world_from_camera for n in names])
+    b = np.array([truth.train[n].world_from_camera for n in names])
+    angle, distance = camera_errors(a, b)
+    good = angle <= max(3 * float(np.median(angle)), 1.0)
+    world_from_found = align_poses(a[good], b[good])
+    away = float(np.mean(np.linalg.norm(b[:, :3, 3], axis=1)))
+    focal = [abs(found[n].fx / truth.train[n].fx - 1) for n in names]
+    values = {
+        "rotation_mean": float(angle.mean()),
+        "rotation_median": float(np.median(angle)),
+        "rotation_within_10": float(100 * (angle < WITHIN).mean()),
+        "translation_percent": float(100 * distance.mean() / away),
+        "focal_percent": float(100 * np.mean(focal)),
+    }
+    per_view = {}
+    for n in (n for n in truth.test if n in found):
+        moved = move_pose(world_from_found, found[n].world_from_camera)
+        cosine = (np.trace(moved[:3, :3].T @ truth.test[n].world_from_camera[:3, :3]) - 1) / 2
+        per_view[n] = {"held_out_rotation": float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))}
+    return values, world_from_found, per_view
+
+
+def picture_figures(asset: Asset, camera: Camera, light: np.ndarray, reference: np.ndarray, spp: int, seed: int) -> dict[str, float]:
+    """A held-out photo: the asset under the light fitted to it, against the true linear RGBA (H, W, 4), premultiplied on black."""
+    from relit.rendering.mitsuba_scene import build_scene, render
+
+    height, width = reference.shape[:2]
+    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, light)
+    shown = render(scene, camera.resized(width, height), spp=spp, seed=seed)
+    a, b = on_white(shown), on_white(reference)
+    inside = reference[..., 3] >= m.MASK
+    return {
+        "novel_psnr": m.psnr(a, b),
+        "novel_ssim": float(m.ssim_map(a, b).mean()),
+        "novel_psnr_masked": m.psnr(m.encode(shown[..., :3]), m.encode(reference[..., :3]), inside),
+        "novel_mask_iou": m.mask_iou(shown[..., 3], reference[..., 3]),
+    }
+
+
+def on_white(rgba: np.ndarray) -> np.ndarray:
+    """Premultiplied linear (H, W, 4) -> sRGB picture (H, W, 3) composite on white in linear values, clipped to [0, 1]."""
+    return m.encode(rgba[..., :3] + (1 - np.clip(rgba[..., 3:], 0, 1)))

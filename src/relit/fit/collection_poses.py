@@ -1,0 +1,254 @@
+"""Where each photo of a collection was taken from: coarse models and registration by rendering, in turns.
+
+No pose is known, or only its quadrant. A coarse model is fitted to crops of 64 pixels with the present poses, every photo is registered
+against renderings of it from all around, and so on, from frequency to frequency: what the photos agree on sharpens, and a
+photo whose pose was wrong finds its place by search, not by descent. With hints (quadrants) all photos take part from the start. Without,
+the model starts as one inflated silhouette and grows: only viewpoints near those that it has seen are trusted, the photos that
+match best join first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from relit.cameras.se3 import look_at
+from relit.conventions import similarity
+from relit.fit.pixels import make_bank
+from relit.fit.register import (
+    Crop,
+    crop_rings,
+    crop_views,
+    directions_around,
+    hint_prior,
+    make_gallery,
+    near,
+    refine,
+    search,
+    views_from,
+    volume_render,
+)
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.geometry.hull import distance_of, visual_hull
+from relit.geometry.sdf import node_positions
+from relit.scene import Camera
+
+HINT = 0.05  # weight of the hints' prior on scores in the first round, falling to 0
+SPREAD = 0.36  # root mean square radius of silhouettes, unit frame: the gauge of scale
+GREY = 0.3  # mean colour of every crop
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """One entry per round. nodes: a side of the coarse model. steps: of its fit. views: of the gallery. tolerance: share of photos that may
+    contradict a point of the hull."""
+
+    nodes: tuple[int, ...] = (32, 32, 40, 48, 48, 56)
+    steps: tuple[int, ...] = (60, 60, 80, 100, 120, 140)
+    views: tuple[int, ...] = (300, 300, 400, 400, 500, 500)
+    tolerance: tuple[float, ...] = (0.45, 0.35, 0.25, 0.2, 0.12, 0.1)
+
+
+class Quiet:
+    """A stage that keeps nothing: for fits that take a second."""
+
+    def step(self, i, **values):
+        pass
+
+    def load(self, name):
+        return None
+
+    def save(self, name, **arrays):
+        pass
+
+    def checkpoint_due(self):
+        return False
+
+
+def even_colours(crops: list[Crop]) -> list[Crop]:
+    """The crops with the mean colour of the object at GREY: exposure and white of each photo go, shading stays."""
+    out = []
+    for c in crops:
+        inside = (c.mask > 0.5) & (c.weight > 0.5)
+        tint = c.rgb[inside].mean(0) if inside.any() else np.ones(3)
+        out.append(replace(c, rgb=np.clip(c.rgb * (GREY / np.maximum(tint, 1e-4)), 0, 4).astype(np.float32)))
+    return out
+
+
+def distance_for(crop: Crop) -> float:
+    """At which the silhouette's spread is SPREAD."""
+    from relit.fit.register import moments
+
+    spread = moments((crop.mask * crop.weight)[None])[1][0]
+    return float(SPREAD * crop.camera.fx / spread)
+
+
+def pose_towards(crop: Crop, direction: np.ndarray) -> np.ndarray:
+    """model_from_photo (4, 4): the photo seen from `direction`, upright, the silhouette's middle at the origin."""
+    virtual = look_at(np.asarray(direction) / np.linalg.norm(direction) * distance_for(crop))
+    rotation = virtual[:3, :3] @ np.asarray(crop.camera.world_from_camera)[:3, :3].T
+    return similarity(rotation, virtual[:3, 3])
+
+
+def gauge(crops: list[Crop], poses: np.ndarray) -> np.ndarray:
+    """The poses scaled so that silhouettes have SPREAD on average: alternating fits would drift in scale."""
+    scale = np.median([np.linalg.norm(p[:3, 3]) / distance_for(c) for p, c in zip(poses, crops, strict=True)])
+    out = np.array(poses)
+    out[:, :3, 3] /= scale
+    return out
+
+
+def coarse_model(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, tolerance: float, seed: int, limit=None) -> VolumeModel:
+    """Hull by vote and a short volume fit. limit: (n, n, n) bool, where the object may be, or None."""
+    cameras, masks = crop_views(crops, poses), [c.mask for c in crops]
+    for more in (tolerance, 0.5 * (tolerance + 0.6), 0.6, 0.75):
+        try:
+            values = visual_hull(cameras, masks, nodes, tolerance=more)
+            if limit is not None:
+                values = distance_of((values < 0) & limit)
+        except ValueError:
+            continue
+        if (values < 0).sum() > 50:
+            break
+    else:
+        raise ValueError("the silhouettes have nothing in common")
+    model = start_model(values, np.full(3, GREY), None, full=False)
+    bank = make_bank(cameras, [c.rgb for c in crops], masks)
+    options = VolumeOptions((nodes,), (steps,), 4096, sdf_rate=0.1, feature_rate=0.03, sharpness=(0.7, 1.5), step=0.8)
+    return fit_volume(bank, model, options, Quiet(), seed)
+
+
+def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep: int = 3):
+    """Poses (P, 4, 4) and scores (P,) when each photo's direction is known to within `degrees`. directions: (P, 3) unit, zeros where a
+    photo has none: such photos are registered from the second round on, wherever they fit."""
+    rings = crop_rings(crops)
+    hinted = np.linalg.norm(directions, axis=1) > 0.5
+    poses = np.array([pose_towards(c, d if h else [0, 0, 1.0]) for c, d, h in zip(crops, directions, hinted, strict=True)])
+    rounds, used, scores = len(schedule.nodes), np.flatnonzero(hinted), np.zeros(len(crops))
+    for i in range(rounds):
+        some = [crops[k] for k in used]
+        model = coarse_model(some, gauge(crops, poses)[used], schedule.nodes[i], schedule.steps[i], schedule.tolerance[i], seed + i)
+        render = volume_render(model)
+        gallery = make_gallery(render, views_from(directions_around(schedule.views[i], seed + i)))
+        prior = HINT * (1 - i / rounds) * hint_prior(gallery, directions, degrees, 15.0) * hinted[:, None, None]
+        allowed = near(gallery, directions, degrees) | ~hinted[:, None]
+        found = search(crops, gallery, keep, rings=rings, prior=prior, allowed=allowed)
+        poses, scores = found.poses[:, 0], found.scores[:, 0]
+        if i > 0:
+            poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1)
+        used = np.arange(len(crops)) if len(used) == len(crops) else np.flatnonzero(hinted | (scores > np.median(scores[hinted])))
+        say(f"round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
+    return gauge(crops, poses), scores
+
+
+def best_refined(crops, found, render, rings, keep: int):
+    """Refine the first `keep` hypotheses of each photo, and take the best."""
+    best, score = found.poses[:, 0].copy(), np.full(len(crops), -1.0)
+    for k in range(min(keep, found.poses.shape[1])):
+        poses, scores = refine(crops, found.poses[:, k], render, rings=rings)
+        better = (scores > score) & (found.scores[:, k] > -1)
+        best[better], score[better] = poses[better], scores[better]
+    return best, score
+
+
+# ---------------------------------------------------------------- without hints
+
+
+def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarray:
+    """(n, n, n) bool: where the object may be when one photo was seen from `camera`: as thick as its outline is far."""
+    p = node_positions(nodes).reshape(-1, 3)
+    to_outline = distance_transform_edt(crop.mask > 0.5) * (np.linalg.norm(camera.centre) / camera.fx)
+    q = camera.project(p)
+    u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
+    ok = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    limit = np.zeros(len(p))
+    limit[ok] = np.minimum(to_outline[v[ok], u[ok]] * 1.4, 0.6)
+    depth = np.abs(p @ camera.world_from_camera[:3, 2])
+    return (depth < limit * loosen + 0.03).reshape(nodes, nodes, nodes)
+
+
+def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=None, nodes: int = 40):
+    """Poses (P, 4, 4) and scores (P,) from one photo on: round i registers all photos and keeps the sizes[i] best for the next model."""
+    rings = crop_rings(crops) if rings is None else rings
+    poses = np.array([pose_towards(c, np.array([0.0, 0.0, 1.0])) for c in crops])
+    used, scores = [first], np.zeros(len(crops))
+    anchor = poses[first]
+    for i, size in enumerate(sizes):
+        some = [crops[k] for k in used]
+        centres = np.array([poses[k][:3, 3] / np.linalg.norm(poses[k][:3, 3]) for k in used])
+        spread = np.degrees(np.arccos(np.clip((centres @ centres[used.index(first)]).min(), -1, 1)))
+        camera = crop_views([crops[first]], anchor[None])[0]
+        limit = inflated(crops[first], camera, nodes, 1 + spread / 40) if spread < 75 else None
+        tolerance = 0.4 if len(used) < 5 else 0.2 if i < len(sizes) - 2 else 0.12
+        model = coarse_model(some, poses[used], nodes, 60 if len(used) < 10 else 90, tolerance, seed + i, limit)
+        render = volume_render(model)
+        gallery = make_gallery(render, views_from(directions_around(400, seed + i)))
+        seen = near(gallery, centres, 55).any(0)
+        found = search(crops, gallery, 1, rings=rings, allowed=np.tile(seen, (len(crops), 1)))
+        poses, scores = found.poses[:, 0], found.scores[:, 0]
+        if i >= 4:
+            poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 4.0, 2.0))
+        poses = gauge(crops, poses)
+        used = sorted(set(np.argsort(-scores)[:size].tolist()) | {first})
+        say(f"grown from photo {first}: {len(used)} of {len(crops)} photos, mean score {scores[used].mean():.3f}", poses, scores)
+        anchor = poses[first]
+    return poses, scores
+
+
+def find_poses(
+    crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, keep: int, starts: int, without, seed: int, say
+):
+    """Poses (P, 4, 4) and scores (P,), from hints where half of the photos have them, else by growth. without: names of
+    `collection.WITHOUT`."""
+    hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
+    keep = 1 if "multiplex" in without else keep
+    if "search" in without:
+        return np.array([pose_towards(c, d if d.any() else [0, 0, 1.0]) for c, d in zip(crops, directions, strict=True)]), np.ones(
+            len(crops)
+        )
+    if hinted >= 0.5:
+        return poses_from_hints(crops, directions, degrees, schedule, seed, lambda text, *_: say(text), keep)
+    return poses_by_growth(crops, starts, keep, seed, lambda text, *_: say(text))
+
+
+def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
+    """Grow from several photos for a few rounds, go on with the one that agrees best, and settle with all photos."""
+    rings, count = crop_rings(crops), len(crops)
+    first = start_photos(crops, rings, starts)
+    early = sorted({min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2)})
+    tried = []
+    for photo in first:
+        state = grow(crops, photo, early, seed, say, rings)
+        tried.append((float(np.mean(np.sort(state[1])[-early[-1] :])), photo))
+    best = max(tried)[1]
+    late = [min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2, 0.27, 0.37, 0.47, 0.57, 0.75, 1, 1, 1)]
+    poses, _ = grow(crops, best, late, seed, say, rings)
+    return settle(crops, poses, rings, keep, seed, say)
+
+
+def start_photos(crops: list[Crop], rings, count: int) -> list[int]:
+    """Photos to start from: seen large and unlike each other, by the descriptors' own distances."""
+    from relit.fit.register import all_scores
+
+    alike = all_scores(rings, rings).max(2)
+    chosen = [int(np.argsort(-alike.mean(1))[0])]  # the one most like the others
+    while len(chosen) < min(count, len(crops)):
+        gain = alike.mean(1) - 0.7 * alike[:, chosen].max(1)
+        gain[chosen] = -np.inf
+        chosen.append(int(gain.argmax()))
+    return chosen
+
+
+def settle(crops: list[Crop], poses: np.ndarray, rings, keep: int, seed: int, say, rounds: int = 3):
+    """A few rounds with all photos and no restriction on the viewpoints."""
+    scores = np.zeros(len(crops))
+    for i in range(rounds):
+        model = coarse_model(crops, gauge(crops, poses), 48, 120, 0.12, seed + 100 + i)
+        render = volume_render(model)
+        gallery = make_gallery(render, views_from(directions_around(500, seed + 100 + i)))
+        found = search(crops, gallery, keep, rings=rings)
+        poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1)
+        say(f"settling, round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
+    return gauge(crops, poses), scores

@@ -1,0 +1,195 @@
+"""The surface pass of a collection: one material, one light per photo.
+
+As fit/surface.py, whose priors and Monte Carlo estimate it shares; every point stands under the light of the photo that shows it. Lights
+are few numbers each under a learnt prior (lighting/per_photo.py). A photo that the model cannot explain is silenced: posterior scaling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.losses import display_weight, weighted_mean
+from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.surface import SurfaceOptions, material_prior, neighbours, parsimony
+from relit.lighting.per_photo import TEXELS, PhotoLights, light_prior, log_lights
+from relit.materials.field import MaterialField, material_at, project, slope_at
+from relit.rendering.transport import TraceableMesh, bent_normal, first_hits, reflected, sample_lights
+
+HISTORY = 1000  # losses in the ring buffer of posterior scaling
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """rate: step of the lights' numbers. prior: weight of |c|^2 / 2 per photo. neutral: of the mean chroma of all gains: without it, base
+    colour and lights drift apart in blue and orange. posterior: whether photos are scaled."""
+
+    rate: float = 0.03
+    prior: float = 1e-3
+    neutral: float = 1.0
+    posterior: bool = True
+
+
+@dataclass
+class CollectionSurface:
+    """coefficients: (V, K), gains: (V, 3) log: float32. losses: the last losses of single photos. weights: (V,) posterior."""
+
+    material: MaterialField
+    coefficients: np.ndarray
+    gains: np.ndarray
+    weights: np.ndarray
+    losses: list[float] = field(default_factory=list)
+
+    def lights(self) -> np.ndarray:
+        """(V, TEXELS * 3) log radiance."""
+        return log_lights(self.coefficients, self.gains)
+
+
+def start_collection_surface(material: MaterialField, tints: np.ndarray, albedo: float) -> CollectionSurface:
+    """tints: (V, 3) mean radiance of the object in each photo; albedo: mean base colour. A light of radiance L shows albedo * L."""
+    k = light_prior()[1].shape[0]
+    gains = np.log(np.maximum(tints, 1e-3) / albedo).astype(np.float32)
+    even = np.exp(light_prior()[0]).reshape(TEXELS, 3).mean(0)
+    gains = gains - np.log(even)
+    return CollectionSurface(material, np.zeros((len(tints), k), np.float32), gains, np.ones(len(tints), np.float32))
+
+
+def posterior(losses: np.ndarray, history: list[float]) -> np.ndarray:
+    """clip(tanh((μ - L) / σ) + 1, 0, 1), μ and σ of the ring buffer. SAMURAI Sec. 3.4 prints max(tanh(.) + 1, 1), which cannot silence a
+    bad photo; its code clips, and so does this."""
+    if len(history) < 20:
+        return np.ones(len(losses), np.float32)
+    mean, deviation = float(np.mean(history)), float(np.std(history))
+    return np.clip(np.tanh((mean - losses) / max(deviation, 1e-6)) + 1, 0, 1).astype(np.float32)
+
+
+def fit_collection_surface(
+    bank: PixelBank,
+    mesh: TraceableMesh,
+    model: CollectionSurface,
+    options: SurfaceOptions,
+    light: LightOptions,
+    stage,
+    seed: int = 0,
+    frozen: bool = False,
+) -> CollectionSurface:
+    """Run the pass; returns the same model, optimised. frozen: only lights move (held-out photos). Resumes from the stage's checkpoint."""
+    material, first, views, count = model.material, 0, bank.views, options.points
+    saved = stage.load("checkpoint")
+    if saved:
+        first = int(saved["step"])
+        material.colour, material.metallic, material.slope = (mi.Float(saved[n]) for n in ("colour", "metallic", "slope"))
+        model.coefficients, model.gains, model.weights = saved["coefficients"], saved["gains"], saved["weights"]
+    rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
+    adam_colour, adam_metallic, adam_slope = (Adam(dr.width(p)) for p in (material.colour, material.metallic, material.slope))
+    adam_slope.floor = options.slope_calm
+    adam_c, adam_g = Adam(model.coefficients.size), Adam(model.gains.size)
+    ratio = mi.Float(np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2))
+    lights = PhotoLights(dr.exp(mi.Float(model.lights().ravel())), views)
+    basis = light_prior()[1]
+    even = np.exp(light_prior()[0]).reshape(TEXELS, 3).mean(0)
+    level = mi.Float((np.exp(model.gains) * even).astype(np.float32).ravel())  # what arrives on average: for what blocks a direction
+    running = np.zeros(views)
+
+    def step(i: int) -> dict:
+        nonlocal running
+        decay = cosine_decay(i / options.steps, 0.05)
+        warm = min(1.0, 0.05 + (i / (options.warm * options.steps)) ** 2)
+        pixel = draw_pixels(bank, rng, count)
+        dr.eval(pixel, rng)
+        batch = batch_of(bank, pixel)
+        points = first_hits(mesh, batch.o, batch.d)
+        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
+        points.valid = valid
+        dr.eval(points, batch.rgb, batch.view)
+        near = neighbours(mesh, points, options.similarity_reach, rng)
+        dr.eval(near, rng)
+        shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (count - 1))
+        of = lights.of(dr.repeat(batch.view, options.directions))
+        with dr.suspend_grad():
+            start = material_at(material, points.uv, valid)
+            smooth_n = points.n
+            points.n = bent_normal(points, slope_at(material, points.uv, valid))
+            dr.eval(start.base, start.roughness, start.metallic, points.n)
+        drawn = sample_lights(mesh, points, start, of, options.directions, rng)
+        drawn.blocked = drawn.blocked * dr.gather(mi.Color3f, level, of.light)  # what blocks is lit by the same photo's light
+        dr.eval(drawn.blocked)
+
+        leaf = mi.Float(model.lights().ravel())
+        params = [leaf] if frozen else [leaf, material.colour, material.metallic, material.slope]
+        dr.enable_grad(*params)
+        lights.radiance = dr.exp(leaf)
+        surface = material_at(material, points.uv, valid)
+        points.n = smooth_n
+        slope = slope_at(material, points.uv, valid)
+        points.n = bent_normal(points, slope)
+        a, b = reflected(points, drawn, surface, of)
+        weight = dr.gather(mi.Float, mi.Float(model.weights), batch.view)
+        each = residuals(a, b, batch.rgb)
+        fit = weighted_mean(each, dr.select(valid, weight, 0))
+        loss = fit
+        if not frozen:
+            smoothing = dr.opaque(mi.Float, options.smooth_colour)
+            loss = loss + material_prior(material, surface, near, valid, options, smoothing)
+            loss = loss + parsimony(material, surface, points.uv, valid, shift, options)
+            loss = loss + options.slope_small * dr.mean(dr.select(valid, dr.squared_norm(slope), 0))
+        dr.backward(loss)
+        gradients = [dr.grad(p) for p in params]
+        dr.disable_grad(*params)
+        dr.eval(gradients, fit, each)
+        if not frozen:
+            material.colour = adam_colour.step(dr.detach(material.colour), gradients[1], options.colour_rate * decay * warm, ratio)
+            material.metallic = adam_metallic.step(dr.detach(material.metallic), gradients[2], options.metallic_rate * decay)
+            slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
+            material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
+            project(material)
+            dr.eval(material.colour, material.metallic, material.slope)
+        g = np.array(gradients[0]).reshape(views, TEXELS * 3)
+        gc = g @ basis.T + light.prior / views * model.coefficients
+        gg = g.reshape(views, TEXELS, 3).sum(1)
+        if not frozen:
+            chroma = model.gains - model.gains.mean(1, keepdims=True)
+            gg = gg + light.neutral / views * np.mean(chroma, 0)
+        rate = light.rate * decay
+        c = adam_c.step(mi.Float(model.coefficients.ravel()), mi.Float(gc.astype(np.float32).ravel()), 2 * rate)
+        k = adam_g.step(mi.Float(model.gains.ravel()), mi.Float(gg.astype(np.float32).ravel()), rate)
+        dr.eval(c, k)
+        model.coefficients, model.gains = np.array(c).reshape(views, -1), np.array(k).reshape(views, 3)
+        lights.radiance = dr.exp(mi.Float(model.lights().ravel()))
+        dr.eval(lights.radiance)
+        lights.rebuild()
+        if light.posterior and not frozen:
+            running = _watch(model, np.array(each), np.array(valid), np.array(batch.view), running, i, options.steps)
+        return {"colour": fit}
+
+    def state() -> dict:
+        arrays = {"colour": np.array(material.colour), "metallic": np.array(material.metallic), "slope": np.array(material.slope)}
+        return {**arrays, "coefficients": model.coefficients, "gains": model.gains, "weights": model.weights}
+
+    run_steps(stage, first, options.steps, step, state)
+    return model
+
+
+def residuals(a, b, target):
+    """Per point: mean over channels of display_weight (a - L*)(b - L*), unbiased for the squared error. A pixel whose file value is
+    saturated only says "at least this bright"."""
+    value = (a - target) * (b - target) * display_weight(target)
+    value = dr.select((target >= 0.99) & (dr.detach((a + b) * 0.5) > target), 0, value)
+    return (value.x + value.y + value.z) / 3
+
+
+def _watch(model: CollectionSurface, each, valid, view, running, i: int, steps: int) -> np.ndarray:
+    """Follow each photo's loss, put it into the ring buffer, set the weights once the lights have settled. Returns the running means."""
+    sums = np.bincount(view[valid], each[valid], len(model.weights))
+    counts = np.bincount(view[valid], minlength=len(model.weights))
+    seen = counts > 0
+    mean = sums / np.maximum(counts, 1)
+    running = np.where(seen, np.where(running == 0, mean, 0.95 * running + 0.05 * mean), running)
+    model.losses = [*model.losses, *running[seen].tolist()][-HISTORY:]
+    if i > 0.15 * steps:
+        model.weights = posterior(running, model.losses)
+    return running
