@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation
 from relit.cameras.se3 import exp_so3
 from relit.scene import Camera
 
+ZOOM = 4.0  # a focal length is known less well than a pose is: it moves so much faster
 CAMERA_FLOATS = 16  # fx fy cx cy, then the 3x4 pose row by row
 
 
@@ -21,7 +22,7 @@ class PixelBank:
     """views, total: counts of photos and pixels. rgbm: Float [total * 4], linear RGB and mask. normals: Float [total * 4] or None
     (camera axes, last entry 1 where known). cameras: Float [views * 16]. offsets, widths: UInt32 [views]. candidates: UInt32, the
     pixels that batches are drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector, translation) or
-    [views * 7] (and the log of a factor on the focal lengths)."""
+    [views * 7] (see `rays_through`)."""
 
     views: int
     total: int
@@ -110,13 +111,14 @@ def rays_through(cameras, view, x, y, corrections=None):
 
     A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by the translation, both in the unit frame.
     Where corrections have seven numbers a view, the camera turns about the ORIGIN of the unit frame (a viewpoint that is wrong is put right
-    without moving the picture), then moves, and the seventh is the logarithm of a factor on the focal lengths.
+    without moving the picture), then moves, and the seventh is 1 / ZOOM of the logarithm of a factor on the focal lengths and on the distance from the
+    origin together (what stands there keeps its size in the picture; only the perspective changes).
     """
     k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
     each = 6 if corrections is None else dr.width(corrections) * CAMERA_FLOATS // dr.width(cameras)
     if each == 7:
-        zoom = dr.exp(-dr.gather(mi.Float, corrections, view * 7 + 6))
+        zoom = dr.exp(-ZOOM * dr.gather(mi.Float, corrections, view * 7 + 6))
         lx, ly = lx * zoom, ly * zoom
     d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
     o = mi.Vector3f(k[1].w, k[2].w, k[3].w)
@@ -129,7 +131,7 @@ def rays_through(cameras, view, x, y, corrections=None):
             turned = dr.cross(w, v)
             return v + (1 - theta2 / 6 * (1 - theta2 / 20)) * turned + (0.5 - theta2 / 24 * (1 - theta2 / 30)) * dr.cross(w, turned)
 
-        d, o = turn(d), (turn(o) if each == 7 else o) + mi.Vector3f(c[3], c[4], c[5])
+        d, o = turn(d), (turn(o) / zoom if each == 7 else o) + mi.Vector3f(c[3], c[4], c[5])
     return o, d
 
 
@@ -141,7 +143,8 @@ def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
         turn, zoom = exp_so3(c[:3]), 1.0
         pose[:3, :3] = turn @ pose[:3, :3]
         if len(c) == 7:
-            pose[:3, 3], zoom = turn @ pose[:3, 3], float(np.exp(c[6]))
+            zoom = float(np.exp(ZOOM * c[6]))
+            pose[:3, 3] = zoom * (turn @ pose[:3, 3])
         pose[:3, 3] += c[3:6]
         out.append(replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom, world_from_camera=pose))
     return out
