@@ -1,15 +1,11 @@
 """Loss terms against NumPy, what makes them fair to noise and to dark pixels, and the step along the common scale."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.loop import Adam
 from relit.fit.losses import display_loss, display_weight, mask_loss, normal_loss, weighted_mean
-from relit.fit.surface import SurfaceModel, SurfaceOptions, dual_loss, exchange_scale, light_prior
-from relit.lighting.environment import Environment
-from relit.materials.field import start_material
+from relit.fit.surface import SurfaceOptions, dual_loss, light_prior
 
 N = 500
 
@@ -98,32 +94,7 @@ def test_a_saturated_pixel_only_says_at_least():
     assert number(dual_loss(darker, darker, colour(target), nothing)) == 0
 
 
-# ---------------------------------------------------------------- light and scale
-
-
-def model(size=4, rows=4):
-    rng = np.random.default_rng(4)
-    material = start_material(size, rng.uniform(0.2, 0.5, (size, size, 3)), 0.5, 0.0)
-    log_light = mi.Float(rng.normal(size=rows * 2 * rows * 3).astype(np.float32))
-    return SurfaceModel(material, log_light, Environment(dr.exp(log_light), rows, 2 * rows))
-
-
-def test_exchange_of_scale_leaves_diffuse_light_alone_and_follows_the_slope():
-    """Light times e^c, colour times e^-c, channel by channel, against the slope of the loss along that line; roughness stays."""
-    m = model()
-    colour_before, light_before = np.array(m.material.colour).reshape(-1, 4), np.array(m.log_light).reshape(-1, 3)
-    g_colour = np.zeros_like(colour_before)
-    g_light = np.zeros_like(light_before)
-    g_light[:, 0] = 0.1  # red: the light should fall
-    g_colour[:, 1] = 0.1  # green: the colour should fall, so the light rises
-    g_colour[:, 3] = 5.0  # roughness is no part of it
-    exchange_scale(m.material, m, Adam(3), mi.Float(g_colour.ravel()), mi.Float(g_light.ravel()), 0.02)
-    colour_after, light_after = np.array(m.material.colour).reshape(-1, 4), np.array(m.log_light).reshape(-1, 3)
-    c = (light_after - light_before).mean(0)
-    np.testing.assert_allclose(light_after - light_before, np.broadcast_to(c, light_before.shape), atol=1e-6)
-    np.testing.assert_allclose(colour_after[:, :3] * np.exp(c), colour_before[:, :3], rtol=1e-5)
-    np.testing.assert_array_equal(colour_after[:, 3], colour_before[:, 3])
-    np.testing.assert_allclose(c, [-0.02, 0.02, 0.0], atol=1e-5)
+# ---------------------------------------------------------------- light
 
 
 def test_light_prior_prefers_even_grey_light():

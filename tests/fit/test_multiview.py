@@ -152,7 +152,10 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
     assert len({count for _, _, count in late}) == 1
 
 
-@pytest.mark.parametrize("without", ["hull", "interreflection", "exchange", "material_prior", "colour_smoothing", "light_prior"])
+NAMES = ["hull", "interreflection", "exchange", "material_prior", "colour_smoothing", "light_prior", "parsimony", "normal_map"]
+
+
+@pytest.mark.parametrize("without", NAMES)
 def test_every_ablation_changes_the_result(capture_folder, tmp_path, monkeypatch, without):
     """Each named part really is a part: switched off, what it acts on is not reached, and the fit still ends in an asset."""
     import relit.fit.multiview as multiview

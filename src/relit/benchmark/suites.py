@@ -87,8 +87,59 @@ MULTIVIEW = Suite(
         "material_prior": ("without=material_prior",),
         "colour_smoothing": ("without=colour_smoothing",),
         "light_prior": ("without=light_prior",),
+        "parsimony": ("without=parsimony",),
+        "normal_map": ("without=normal_map",),
         "priors": ("without=material_prior,colour_smoothing,light_prior",),
     },
 )
 
-SUITES: dict[str, Suite] = {"multiview": MULTIVIEW}
+TEA = "assets/tea_set_01_1k.glb"
+FLASH = Suite(
+    kind="flash",
+    items=(
+        Item("spot", "assets/spot/spot.obj", ()),
+        Item("teapot", TEA, (), {"nodes": ["tea_set_01_teapot_01", "tea_set_01_teapot_01_lid"]}),
+        Item("cup", TEA, (), {"nodes": ["tea_set_01_cup_small_01"]}),  # concave: its inside lights itself
+    ),
+    options={"views": 120, "test_views": 20, "resolution": 400, "spp": 64, "test_spp": 256, "seed": 0},
+    synthesize="relit.capture.synthetic_flash.synthesize_flash",
+    evaluate="relit.evaluate.flash.evaluate_flash",
+    bars={
+        "seconds": ("<=", 720.0),
+        "peak_memory": ("<=", 4.0),
+        "novel_psnr": (">=", 32.4),
+        "diffuse_psnr": (">=", 36.3),
+        "specular_psnr": (">=", 30.2),
+        "roughness_mse": ("<=", 0.85e-3),
+        "flash_angle": ("<=", 0.2),
+    },
+    ablations={name: (f"without={name}",) for name in ("offset", "shadow", "interreflection", "features", "refinement")}
+    | {"offset+shadow": ("without=offset,shadow",)},
+)
+
+LIGHTS = tuple(
+    f"envmaps/{name}_1k.hdr"
+    for name in ("adams_place_bridge", "empty_warehouse_01", "forest_slope", "immenstadter_horn", "kiara_1_dawn", "lebombo")
+)
+COLLECTION = Suite(
+    kind="collection",
+    items=(
+        Item("spot", "assets/spot/spot.obj", LIGHTS, {"roughness": 0.4, "metallic": 0.0}),
+        Item("boombox", "assets/BoomBox.glb", LIGHTS),
+        Item("stool", "assets/painted_wooden_stool_1k.glb", LIGHTS),
+    ),
+    options={"views": 60, "test_views": 6, "resolution": 400, "spp": 48, "test_spp": 192, "seed": 0},
+    synthesize="relit.capture.synthetic_collection.synthesize_collection",
+    evaluate="relit.evaluate.collection.evaluate_collection",
+    bars={
+        "seconds": ("<=", 1500.0),
+        "peak_memory": ("<=", 4.0),
+        "rotation_mean": ("<=", 3.0),
+        "rotation_within_10": (">=", 95.0),
+        "novel_psnr": (">=", 25.0),
+        "albedo_psnr": (">=", 22.0),
+    },
+    ablations={name: (f"without={name}",) for name in ("multiplex", "search", "posterior", "coarse_to_fine", "quadrants", "light_prior")},
+)
+
+SUITES: dict[str, Suite] = {"multiview": MULTIVIEW, "flash": FLASH, "collection": COLLECTION}

@@ -59,7 +59,7 @@ class MultiviewOptions:
     explore_steps: int = 400
     faces: int = 40_000
     texture: int = 512
-    surface_steps: int = 1500
+    surface_steps: int = 3500
     points: int = 4096
     directions: int = 64
     light: int = 64
@@ -73,7 +73,7 @@ class MultiviewOptions:
 
 WITHOUT = {  # what an ablation switches off: settings of the surface pass
     "interreflection": {},  # what blocks a direction is black
-    "exchange": {"scale_rate": 0.0},
+    "exchange": {"exchange_rate": 0.0},
     "material_prior": {"smooth_roughness": 0.0, "smooth_metallic": 0.0, "metallic_binary": 0.0, "metallic_sparse": 0.0},
     "colour_smoothing": {"smooth_colour": 0.0},
     "light_prior": {"light_smooth": 0.0, "light_neutral": 0.0},
@@ -91,7 +91,7 @@ PRESETS = {
         "explore_steps": 200,
         "faces": 12_000,
         "texture": 256,
-        "surface_steps": 400,
+        "surface_steps": 700,
         "points": 2048,
         "light": 32,
     },
@@ -104,7 +104,7 @@ PRESETS = {
         "explore_steps": 800,
         "faces": 60_000,
         "texture": 1024,
-        "surface_steps": 4000,
+        "surface_steps": 8000,
     },
 }
 
@@ -298,7 +298,8 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
         guess = base_without_shading(radiance, mesh.normals, areas)
         start = fill_gutters(interpolate(guess, mesh.faces, face, bary), known)
         mean = float((radiance * areas[:, None]).sum() / areas.sum() / 3)
-        model = start_surface(start, known, mean, o)
+        normals = fill_gutters(interpolate(mesh.normals, mesh.faces, face, bary), known)
+        model = start_surface(start, known, mean, o, normals)
         reflecting = radiance * (0.0 if "interreflection" in options.without else 1.0)
         fit_surface(bank, TraceableMesh(mesh, reflecting), model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)

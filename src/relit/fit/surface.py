@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.fit.exchange import REFRESH, Exchange
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
@@ -28,14 +29,15 @@ class SurfaceOptions:
     """steps, points (pixels per step), directions (per point). texture: texels a side. light: rows of the environment (twice as many
     columns).
 
-    colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step; scale_rate: of
-    `exchange_scale` (log). warm: part of the steps over which colour_rate rises from a twentieth. roughness_start: first roughness.
-    smooth_roughness, smooth_metallic, smooth_colour: weights of differences between similar neighbours, up to similarity_reach (unit
-    frame) apart and similarity_width in base colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. light_smooth: total
-    variation of the log radiance. light_neutral: its chroma. parsimony, parsimony_width, parsimony_share: see `parsimony`.
-    slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth: weights of
-    `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise does not
-    move it at full rate.
+    colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step;
+    exchange_rate: of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of the steps over
+    which colour_rate rises from a twentieth. roughness_start: first roughness. smooth_roughness, smooth_metallic, smooth_colour:
+    weights of differences between similar neighbours, up to similarity_reach (unit frame) apart and similarity_width in base colour;
+    smooth_shade: power of `brightness` in smooth_colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. light_smooth: total
+    variation of the log radiance. light_neutral: its chroma. parsimony, parsimony_width, parsimony_share: see `parsimony`. slope_rate,
+    slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth: weights of `slope_prior`,
+    whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise does not move it at
+    full rate.
     """
 
     steps: int = 700
@@ -44,15 +46,17 @@ class SurfaceOptions:
     texture: int = 512
     light: int = 64
     colour_rate: float = 0.01
-    roughness_rate: float = 0.015
+    roughness_rate: float = 0.03
     metallic_rate: float = 0.01
     light_rate: float = 0.05
-    scale_rate: float = 0.02
+    exchange_rate: float = 0.02
+    exchange_rows: int = 4
     warm: float = 0.3
-    roughness_start: float = 0.3
+    roughness_start: float = 0.4
     smooth_roughness: float = 0.1
     smooth_metallic: float = 0.1
     smooth_colour: float = 0.2
+    smooth_shade: float = 0.9
     similarity_reach: float = 0.15
     similarity_width: float = 0.1
     metallic_binary: float = 0.01
@@ -72,15 +76,18 @@ class SurfaceOptions:
 
 @dataclass
 class SurfaceModel:
-    """material: the textures. log_light: Float [rows * 2 rows * 3], log radiance, lat-long in the unit frame. environment: exp of it."""
+    """material: the textures. log_light: Float [rows * 2 rows * 3], log radiance, lat-long in the unit frame. environment: exp of it.
+    normals: (S, S, 3) unit normals of the texels, or None."""
 
     material: MaterialField
     log_light: Any
     environment: Environment
+    normals: np.ndarray | None = None
 
 
-def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions) -> SurfaceModel:
-    """base: (S, S, 3) first guess of the base colour up to scale (materials.intrinsic), known: (S, S) bool, radiance: mean over the object.
+def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions, normals=None) -> SurfaceModel:
+    """base: (S, S, 3) first guess of the base colour up to scale (materials.intrinsic), known: (S, S) bool, radiance: mean over the object,
+    normals: (S, S, 3) of the texels, None where they stand in many places.
 
     The light starts grey and even, bright enough that the mean base colour is ALBEDO_START.
     """
@@ -89,7 +96,7 @@ def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options:
     material = start_material(options.texture, albedo, options.roughness_start, 0.1)
     h = options.light
     log_light = mi.Float(np.full(h * 2 * h * 3, np.log(max(radiance, 1e-4) / ALBEDO_START), np.float32))
-    return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h))
+    return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h), normals)
 
 
 def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, options: SurfaceOptions, stage, seed: int = 0) -> SurfaceModel:
@@ -106,7 +113,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     environment.rebuild()
     count = options.points
     rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
-    adam_scale = Adam(3)
+    exchange = Exchange(model.normals, material.size**2, options.light, options.exchange_rows)
     adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, model.log_light))
     adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
     ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
@@ -146,7 +153,8 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         points.n = bent_normal(points, slope)
         a, b = reflected(points, lights, surface, environment)
         fit = dual_loss(a, b, batch.rgb, valid)
-        prior = material_prior(material, surface, near, valid, options, colour_smoothing) + light_prior(model.log_light, options)
+        lit = brightness(batch.rgb, surface.base, valid, options.smooth_shade)
+        prior = material_prior(material, surface, near, valid, options, colour_smoothing * lit) + light_prior(model.log_light, options)
         prior += parsimony(material, surface, points.uv, valid, shift, options) + slope_prior(material, bend, close, valid, options)
         dr.backward(fit + prior)
         gradients = [dr.grad(p) for p in params]
@@ -157,7 +165,12 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * decay)
         slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
         material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
-        exchange_scale(material, model, adam_scale, gradients[0], gradients[2], options.scale_rate * decay)
+        if options.exchange_rate > 0:
+            if i % REFRESH == 0 or i == first:
+                exchange.refresh(environment.image())
+            dr.eval(material.colour, model.log_light)
+            rate = options.exchange_rate * decay
+            material.colour, model.log_light = exchange.step(material.colour, model.log_light, gradients[0], gradients[2], rate)
         project(material)
         dr.eval(model.log_light, material.colour, material.metallic, material.slope)
         environment.radiance = dr.exp(model.log_light)
@@ -171,23 +184,6 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
 
     run_steps(stage, first, options.steps, step, state)
     return model
-
-
-def exchange_scale(material: MaterialField, model: SurfaceModel, adam: Adam, colour_gradient, light_gradient, rate: float) -> None:
-    """One step along the direction that texel-wise steps find slowest: all of the light brighter and all base colour darker by the same
-    factor (per channel), or the reverse. Only what is not diffuse (F0 of the dielectric) tells where on this line the truth is."""
-    c = dr.arange(mi.UInt32, dr.width(material.colour)) % 4
-    weighted = colour_gradient * dr.detach(material.colour)
-    k = dr.arange(mi.UInt32, dr.width(model.log_light)) % 3
-    slope = [dr.sum(dr.select(k == i, light_gradient, 0)) - dr.sum(dr.select(c == i, weighted, 0)) for i in range(3)]
-    gradient = dr.zeros(mi.Float, 3)
-    for i in range(3):
-        dr.scatter(gradient, slope[i], mi.UInt32(i))
-    move = adam.step(dr.zeros(mi.Float, 3), gradient, rate)
-    dr.eval(move)
-    model.log_light = model.log_light + dr.gather(mi.Float, move, k)
-    factor = dr.select(c < 3, dr.exp(-dr.gather(mi.Float, move, dr.minimum(c, 2))), 1)
-    material.colour = material.colour * factor
 
 
 def dual_loss(a, b, target, valid):
@@ -207,6 +203,13 @@ def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points
         frame = mi.Frame3f(points.n)
         offset = (frame.s * dr.cos(phi) + frame.t * dr.sin(phi)) * r
         return first_hits(mesh, points.x + offset + points.n * r, -points.n)
+
+
+def brightness(rgb, base, valid, power: float):
+    """How much light arrives at each point, 1 on average (Float): what is in the shade shows its colour less, and is smoothed less."""
+    arriving = mi.luminance(rgb) / dr.maximum(mi.luminance(dr.detach(base)), 0.05)
+    mean = weighted_mean(arriving, dr.select(valid, mi.Float(1), 0))
+    return dr.minimum(arriving / dr.maximum(mean, 1e-6), 2) ** power
 
 
 def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing):

@@ -1,0 +1,98 @@
+"""Steps along which light and base colour change against each other.
+
+Where a surface is diffuse, light that is brighter from some side and base colour that is darker on what faces that side look the same:
+steps of single texels crawl along these valleys. Here they are walked along directly. What is not diffuse (the reflections of a
+dielectric's F0, shadows, priors) tells where in a valley the truth is.
+"""
+
+from __future__ import annotations
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.conventions import environment_directions, environment_solid_angles
+from relit.fit.loop import Adam
+
+ROWS = 16  # of the table of normals, and of the light that it is made for
+REFRESH = 20  # steps after which the table follows the light
+
+
+class Exchange:
+    """Moves c (hats x 3) with log L += Σ_k c_k φ_k(ω) and a *= exp(-Σ_k c_k ψ_k(n)): φ_k are the bilinear hats of a lat-long map of
+    `hats` rows, and ψ_k(n) = ∫ L φ_k (n·ω)+ dω / ∫ L (n·ω)+ dω is what share of the irradiance of a surface with normal n they bring.
+    Both sum to 1 over k, so the exchange of one scale per channel is among the moves."""
+
+    def __init__(self, normals: np.ndarray | None, texels: int, light_rows: int, hats: int = 4):
+        """normals: (S, S, 3) unit normal of each of `texels` = S² texels; None where a texel stands in many places and faces all sides."""
+        self.count, self.light_rows = 2 * hats * hats, light_rows
+        d = environment_directions(ROWS, 2 * ROWS).reshape(-1, 3)
+        self._cosines = np.maximum(d @ d.T, 0) * environment_solid_angles(ROWS, 2 * ROWS).reshape(-1)
+        if normals is None:
+            self._cosines[:] = environment_solid_angles(ROWS, 2 * ROWS).reshape(-1)
+            normals = np.tile([0.0, 1.0, 0.0], (texels, 1))
+        self._hats = hat_weights(ROWS, hats)
+        n = normals.reshape(-1, 3)
+        u = np.arctan2(n[:, 0], -n[:, 2]) / (2 * np.pi)
+        v = np.arccos(np.clip(n[:, 1], -1, 1)) / np.pi
+        column = np.floor((u - np.floor(u)) * 2 * ROWS).astype(int) % (2 * ROWS)
+        self.bin = mi.UInt32((np.minimum((v * ROWS).astype(int), ROWS - 1) * 2 * ROWS + column).astype(np.uint32))
+        self._corners = corners(light_rows, hats)
+        self.adam = Adam(3 * self.count)
+        self.share = None
+
+    def refresh(self, radiance: np.ndarray) -> None:
+        """Follow the light (rows, 2 rows, 3)."""
+        light = cv2.resize(radiance.mean(-1), (2 * ROWS, ROWS), interpolation=cv2.INTER_AREA).ravel() + 1e-6
+        share = (self._cosines * light) @ self._hats / (self._cosines @ light)[:, None]
+        self.share = mi.Float(share.astype(np.float32).ravel())
+
+    def step(self, colour, log_light, colour_gradient, light_gradient, rate: float):
+        """(colour, log_light) after one step. colour: Float [S² · 4] base colour and roughness; log_light: Float [rows · 2 rows · 3]."""
+        bins, n, lanes = 2 * ROWS * ROWS, self.count, 3 * self.count
+        gradient = dr.zeros(mi.Float, lanes)
+        texel = dr.arange(mi.UInt32, 2 * self.light_rows**2)
+        g = dr.gather(mi.Color3f, light_gradient, texel)
+        for index, weight in self._corners:
+            dr.scatter_add(gradient, g * weight, index)
+        base, pull = dr.unravel(mi.Vector4f, colour), dr.unravel(mi.Vector4f, colour_gradient)
+        binned = dr.zeros(mi.Float, 3 * bins)
+        dr.scatter_add(binned, mi.Color3f(base.x * pull.x, base.y * pull.y, base.z * pull.z), self.bin)
+        i = dr.arange(mi.UInt32, lanes * bins)
+        b, lane = i % bins, i // bins
+        k, c = lane // 3, lane % 3
+        terms = dr.gather(mi.Float, binned, b * 3 + c) * dr.gather(mi.Float, self.share, b * n + k)
+        gradient -= dr.block_sum(terms, bins)
+        move = self.adam.step(dr.zeros(mi.Float, lanes), gradient, rate)
+        dr.eval(move)
+        for index, weight in self._corners:
+            g = dr.gather(mi.Color3f, move, index) * weight
+            dr.scatter_add(log_light, g, texel)
+        i = dr.arange(mi.UInt32, 3 * bins * n)
+        k, lane = i % n, i // n
+        terms = dr.gather(mi.Float, move, k * 3 + lane % 3) * dr.gather(mi.Float, self.share, (lane // 3) * n + k)
+        factor = dr.gather(mi.Color3f, dr.exp(-dr.block_sum(terms, n)), self.bin)
+        return dr.ravel(mi.Vector4f(base.x * factor.x, base.y * factor.y, base.z * factor.z, base.w)), log_light
+
+
+def hat_weights(rows: int, coarse: int) -> np.ndarray:
+    """(2 rows², 2 coarse²) bilinear weight of each texel of a coarse map at each texel of a finer one; rows sum to 1."""
+    out = np.zeros((2 * rows * rows, 2 * coarse * coarse))
+    y, x = np.mgrid[:rows, : 2 * rows]
+    x, y = (x.ravel() + 0.5) * coarse / rows - 0.5, (y.ravel() + 0.5) * coarse / rows - 0.5
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            weight = np.abs(1 - dx - (x - x0)) * np.abs(1 - dy - (y - y0))
+            row, column = np.clip(y0 + dy, 0, coarse - 1), (x0 + dx) % (2 * coarse)
+            np.add.at(out, (np.arange(len(x)), row * 2 * coarse + column), weight)
+    return out
+
+
+def corners(rows: int, coarse: int):
+    """The same as four pairs (index UInt32, weight Float) for each texel."""
+    w = hat_weights(rows, coarse)
+    order = np.argsort(-w, axis=1)[:, :4]
+    weights = np.take_along_axis(w, order, 1).astype(np.float32)
+    return [(mi.UInt32(np.ascontiguousarray(order[:, j], np.uint32)), mi.Float(np.ascontiguousarray(weights[:, j]))) for j in range(4)]

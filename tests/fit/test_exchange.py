@@ -1,0 +1,115 @@
+"""Steps along which light and base colour change against each other."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from relit.conventions import environment_directions, environment_solid_angles
+from relit.fit.exchange import Exchange, hat_weights
+
+LIGHT, SIZE = 16, 12
+
+
+def start(seed=0, hats=4):
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(SIZE, SIZE, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    light = np.exp(rng.normal(size=(LIGHT, 2 * LIGHT, 3)))
+    colour = np.concatenate([rng.uniform(0.2, 0.5, (SIZE, SIZE, 3)), np.full((SIZE, SIZE, 1), 0.4)], -1)
+    exchange = Exchange(normals, SIZE**2, LIGHT, hats)
+    exchange.refresh(light)
+    return exchange, normals.reshape(-1, 3), light, colour.reshape(-1, 4)
+
+
+def move(exchange, light, colour, g_light, g_colour, rate=0.02):
+    to = lambda a: mi.Float(np.ascontiguousarray(a, np.float32).ravel())  # noqa: E731
+    colour, log_light = exchange.step(to(colour), to(np.log(light)), to(g_colour), to(g_light), rate)
+    return np.array(colour).reshape(-1, 4), np.exp(np.array(log_light).reshape(light.shape))
+
+
+def diffuse(normals, light, colour):
+    d = environment_directions(LIGHT, 2 * LIGHT).reshape(-1, 3)
+    w = environment_solid_angles(LIGHT, 2 * LIGHT).reshape(-1, 1)
+    return colour[:, :3] * (np.maximum(normals @ d.T, 0) @ (light.reshape(-1, 3) * w))
+
+
+def test_weights_of_the_hats_sum_to_one():
+    w = hat_weights(16, 4)
+    assert w.shape == (512, 32) and w.min() >= 0
+    np.testing.assert_allclose(w.sum(1), 1)
+
+
+def test_diffuse_radiance_stays_where_light_moves():
+    """The light moves by many times what the radiance of diffuse surfaces does. Light of one colour: the table is of its mean."""
+    exchange, normals, light, colour = start()
+    light = np.repeat(light.mean(-1, keepdims=True), 3, -1)
+    exchange.refresh(light)
+    before = diffuse(normals, light, colour)
+    rng = np.random.default_rng(1)
+    after_colour, after = move(exchange, light, colour, rng.normal(size=light.shape), np.zeros_like(colour), 0.05)
+    moved = np.abs(np.log(after / light)).mean()
+    changed = np.abs(np.log(diffuse(normals, after, after_colour) / before)).mean()
+    unpaired = np.abs(np.log(diffuse(normals, after, colour) / before)).mean()
+    assert moved > 0.02
+    assert changed < 0.35 * unpaired  # normals are binned to a table of 16 rows
+    np.testing.assert_array_equal(after_colour[:, 3], colour[:, 3].astype(np.float32))
+
+
+def test_one_scale_is_among_the_moves_and_follows_the_slope():
+    """Light times e^c, colour times e^-c, channel by channel, against the slope of the loss along that line."""
+    exchange, _, light, colour = start()
+    g_light, g_colour = np.zeros_like(light), np.zeros_like(colour)
+    g_light[..., 0] = 0.1  # red: the light should fall
+    g_colour[:, 1] = 0.1  # green: the colour should fall, so the light rises
+    g_colour[:, 3] = 5.0  # roughness is no part of it
+    after_colour, after = move(exchange, light, colour, g_light, g_colour)
+    c = np.log(after / light)
+    np.testing.assert_allclose(c, np.broadcast_to([-0.02, 0.02, 0.0], c.shape), atol=1e-4)
+    np.testing.assert_allclose(after_colour[:, :3], colour[:, :3] * np.exp([0.02, -0.02, 0.0]), rtol=1e-4)
+
+
+def test_without_normals_every_texel_is_as_if_it_faced_all_sides():
+    _, _, light, colour = start()
+    exchange = Exchange(None, SIZE**2, LIGHT)
+    exchange.refresh(light)
+    g = np.zeros_like(light)
+    g[..., 1] = 0.1
+    after_colour, after = move(exchange, light, colour, g, np.zeros_like(colour))
+    np.testing.assert_allclose(np.log(after / light), np.broadcast_to([0, -0.02, 0], light.shape), atol=1e-4)
+    np.testing.assert_allclose(after_colour[:, 1], colour[:, 1] * np.exp(0.02), rtol=1e-4)
+
+
+def test_slope_along_a_move_is_that_of_the_loss():
+    """For a loss sum(p log light) + sum(q colour), the gradient that the step sees is the finite difference along each move."""
+    exchange, _, light, colour = start(hats=2)
+    rng = np.random.default_rng(2)
+    p, q = rng.normal(size=light.shape), rng.normal(size=colour.shape)
+    q[:, 3] = 0
+    seen = {}
+
+    class Watch:
+        def step(self, parameter, gradient, rate, ratio=1.0):
+            seen["gradient"] = np.array(gradient)
+            return mi.Float(seen["move"])
+
+    exchange.adam = Watch()
+    for lane in (0, 7, 13, 23):
+        seen["move"] = np.zeros(24, np.float32)
+        seen["move"][lane] = 0.01
+        after_colour, after = move(exchange, light, colour, p, q)
+        change = (p * np.log(after / light)).sum() + (q * (after_colour - colour)).sum()
+        assert change / 0.01 == pytest.approx(seen["gradient"][lane], rel=0.02, abs=0.01)
+
+
+def test_a_step_compiles_nothing_new():
+    exchange, _, light, colour = start()
+    rng = np.random.default_rng(3)
+    move(exchange, light, colour, rng.normal(size=light.shape), rng.normal(size=colour.shape), 0.01)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for k in range(3):
+            exchange.refresh(light * (1 + k))
+            move(exchange, light, colour, rng.normal(size=light.shape), rng.normal(size=colour.shape), 0.01 * (k + 1))
+        history = dr.kernel_history()
+    assert history and all(k["cache_hit"] for k in history if "cache_hit" in k)
