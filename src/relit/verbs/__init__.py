@@ -10,9 +10,11 @@ from relit.verbs.jobs import (
     do_demo,
     do_doctor,
     do_inspect,
+    do_quadrants,
     do_reconstruct,
     doctor_flags,
     inspect_flags,
+    quadrants_flags,
     reconstruct_flags,
 )
 from relit.verbs.measure import benchmark_flags, do_benchmark, do_evaluate, evaluate_flags
@@ -23,6 +25,7 @@ VERBS: dict[str, Verb] = {
     "doctor": Verb("what this machine has, what is missing, and the command that mends it", doctor_flags, do_doctor),
     "demo": Verb("renders its own object, reconstructs it, scores it, writes the report", demo_flags, do_demo),
     "inspect": Verb("what an input is recognised as, and what a reconstruction would take", inspect_flags, do_inspect),
+    "quadrants": Verb("asks where each photo of a collection was taken from", quadrants_flags, do_quadrants),
     "reconstruct": Verb("photos into a relightable asset; giving the same command again resumes", reconstruct_flags, do_reconstruct),
     "export": Verb("the asset as glb, obj, ply, a Mitsuba scene, or a page to send", export_flags, do_export),
     "relight": Verb("pictures of the asset under another light", relight_flags, do_relight),

@@ -77,4 +77,126 @@ def multiview(args) -> None:
     )
 
 
-SYNTHESIZERS: dict[str, Kind] = {"multiview": Kind(multiview_flags, multiview)}
+# ---------------------------------------------------------------- flash
+
+
+def flash_flags(parser: Parser) -> None:
+    more = parser.more.add_argument
+    sampling_flags(parser, views=120, test_views=20, resolution=400, spp=64, test_spp=256)
+    more("--node", nargs="*", default=[], metavar="NAME", help="only these nodes of a .glb (default: all)")
+    more("--flash-offset", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"), help="of the flash, right, down, forward (default -.11 -.06 0)")
+    more("--png", action="store_true", help="photos as 8-bit PNG instead of linear EXR")
+
+
+def flash(args) -> None:
+    if args.roughness is not None or args.metallic is not None:
+        raise UserError("a flash capture's roughness is made with the object", fix="leave out --roughness and --metallic", code=EXIT_USAGE)
+    from relit.capture.synthetic_flash import OFFSET, synthesize_flash
+    from relit.device import use_device
+    from relit.log import Log
+
+    use_device(args.device)
+    synthesize_flash(
+        args.asset,
+        (),
+        args.out,
+        views=args.views,
+        test_views=args.test_views,
+        nodes=args.node,
+        resolution=args.resolution,
+        spp=args.spp,
+        test_spp=args.test_spp,
+        seed=args.seed,
+        offset=args.flash_offset or OFFSET,
+        png=args.png,
+        say=Log().say,
+    )
+
+
+# ---------------------------------------------------------------- collection
+
+
+def collection_flags(parser: Parser) -> None:
+    add = parser.common.add_argument
+    add("--light", required=True, type=Path, nargs="+", metavar="FILE", help="lat-long .hdr or .exr; each photo takes one")
+    sampling_flags(parser, views=60, test_views=6, resolution=400, spp=48, test_spp=192)
+    more = parser.more.add_argument
+    more("--rough-masks", type=float, default=1.0, metavar="PIXELS", help="outlines of masks wander so far (default 1)")
+
+
+def collection(args) -> None:
+    from relit.capture.synthetic_collection import synthesize_collection
+    from relit.device import use_device
+    from relit.log import Log
+
+    use_device(args.device)
+    synthesize_collection(
+        args.asset,
+        args.light,
+        args.out,
+        views=args.views,
+        test_views=args.test_views,
+        resolution=args.resolution,
+        spp=args.spp,
+        test_spp=args.test_spp,
+        seed=args.seed,
+        roughness=args.roughness,
+        metallic=args.metallic,
+        rough_masks=args.rough_masks,
+        say=Log().say,
+    )
+
+
+# ---------------------------------------------------------------- duplicates
+
+
+def duplicates_flags(parser: Parser) -> None:
+    add, more = parser.common.add_argument, parser.more.add_argument
+    add("--light", required=True, type=Path, nargs="+", metavar="FILE", help="lat-long .hdr or .exr")
+    add("--relight", type=Path, nargs="*", default=[], metavar="FILE", help="other lights, for the truth of relighting")
+    add("--count", type=int, default=10, help="objects in the photo (default 10)")
+    add("--test-views", type=int, default=8, help="novel views of the pile (default 8)")
+    more("--resolution", type=int, default=1600, help="pixels a side of the photo (default 1600)")
+    more("--test-resolution", type=int, default=400, help="pixels a side of the novel views (default 400)")
+    more("--spp", type=int, default=64, help="samples a pixel of the photo (default 64)")
+    more("--test-spp", type=int, default=64, help="samples a pixel of what is measured against (default 64)")
+    more("--lean", type=float, default=12.0, metavar="DEGREES", help="standard deviation of the tilt away from the resting pose (default 12)")
+    more("--spread", type=float, default=1.0, help="factor on the radius of the pile (default 1)")
+    more("--node", nargs="*", default=[], metavar="NAME", help="only these nodes of a .glb (default: all)")
+
+
+def duplicates(args) -> None:
+    if len(args.light) != 1:
+        raise UserError("a photo has one light", fix="give one file to --light; others go to --relight", code=EXIT_USAGE)
+    from relit.capture.synthetic_duplicates import synthesize_duplicates
+    from relit.device import use_device
+    from relit.log import Log
+
+    use_device(args.device)
+    synthesize_duplicates(
+        args.asset,
+        args.light[0],
+        args.out,
+        count=args.count,
+        test_views=args.test_views,
+        relights=args.relight,
+        resolution=args.resolution,
+        test_resolution=args.test_resolution,
+        spp=args.spp,
+        test_spp=args.test_spp,
+        seed=args.seed,
+        lean=args.lean,
+        spread=args.spread,
+        nodes=args.node,
+        roughness=args.roughness,
+        metallic=args.metallic,
+        say=Log().say,
+    )
+
+
+SYNTHESIZERS: dict[str, Kind] = {
+    "multiview": Kind(multiview_flags, multiview),
+    "flash": Kind(flash_flags, flash),
+    "collection": Kind(collection_flags, collection),
+    "duplicates": Kind(duplicates_flags, duplicates),
+}

@@ -1,0 +1,64 @@
+"""`relit quadrants`: keys to answers, in the terminal and over the page's server."""
+
+import json
+import threading
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+
+from relit.capture import open_capture
+from relit.capture.samurai import read_hints
+from relit.errors import UserError
+from relit.images import write_srgb
+from relit.viewer.quadrants import answers_of, ask_in_terminal, quadrant_server
+
+
+@pytest.fixture
+def capture(tmp_path):
+    for i in range(3):
+        write_srgb(tmp_path / f"{i}.png", np.full((20, 30, 3), 0.2 + 0.2 * i, np.float32))
+    return open_capture(tmp_path, masks="none")
+
+
+def test_keys():
+    assert answers_of("af") == ["Left", "Center", "Front"]
+    assert answers_of(" W b") == ["Center", "Above", "Back"]
+    for keys in ("", "ad", "x", "wsf"):
+        with pytest.raises(UserError):
+            answers_of(keys)
+
+
+def test_terminal(capture):
+    said, typed = [], iter(["ad", "af", "", "w"])
+    path = ask_in_terminal(capture, lambda _: next(typed), said.append)
+    assert any("contradict" in text for text in said)
+    hints = read_hints(path.parent, ["0.png", "2.png"])
+    assert np.allclose(hints.directions["0.png"], np.array([-1, 0, 1]) / np.sqrt(2))
+    assert np.allclose(hints.directions["2.png"], [0, 1, 0])
+    ask_in_terminal(capture, lambda text: "d" if text.startswith("1.png (1 of 1)") else pytest.fail(text), said.append)  # only what is left
+    assert len(json.loads(path.read_text())["frames"]) == 3
+
+
+def test_page(capture):
+    server = quadrant_server(capture)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        with urlopen(server.url) as reply:
+            assert b"where did the camera stand" in reply.read()
+        with urlopen(server.url + "photo.jpg?i=1") as reply:
+            assert reply.read()[:2] == b"\xff\xd8"
+
+        def post(content):
+            body, origin = json.dumps(content).encode(), {"Origin": server.url.rstrip("/")}
+            with urlopen(Request(server.url + "answer", body, origin)) as reply:
+                return json.load(reply)
+
+        assert post({"i": 1, "keys": "sb"})["answer"] == ["Center", "Below", "Back"]
+        with urlopen(server.url + "quadrants") as reply:
+            assert [p["answer"] for p in json.load(reply)["photos"]] == [None, ["Center", "Below", "Back"], None]
+        with pytest.raises(OSError, match="422"):
+            post({"i": 1, "keys": ""})
+    finally:
+        server.shutdown()
+        server.server_close()
