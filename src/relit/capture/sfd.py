@@ -1,10 +1,10 @@
 """One photo of several identical objects and where each of them is: SfD's folders, a photo with a label image, cut-outs, COCO.
 
-    SfD          transforms_train.json and train/000_rgb.png, train/000_instance_seg.png (or raw/000_rgb.png, raw/000_instance_seg.png)
-    labels       NAME_labels.png, NAME_instance_seg.png or NAME_seg.png beside the photo NAME.*: one grey level or colour for each object,
-                 black for the rest
-    cut-outs     cutouts/*.png beside the photo: RGBA pictures of the photo's size, one for each object
-    COCO         a .json with `images` and `annotations` (polygons or run lengths) beside the photo
+SfD          transforms_train.json and train/000_rgb.png, train/000_instance_seg.png (or raw/000_rgb.png, raw/000_instance_seg.png)
+labels       NAME_labels.png, NAME_instance_seg.png or NAME_seg.png beside the photo NAME.*: one grey level or colour for each object,
+             black for the rest
+cut-outs     cutouts/*.png beside the photo: RGBA pictures of the photo's size, one for each object
+COCO         a .json with `images` and `annotations` (polygons or run lengths) beside the photo
 """
 
 from __future__ import annotations
@@ -111,7 +111,9 @@ def open_duplicates(source: Source, *, focal: float | None = None, max_side: int
         focal = header.focal
         if focal is None:
             focal = FOCAL_GUESS * max(w, h)
-            notes.append(f"the focal length is not known; {focal:.0f} pixels are assumed (--focal PIXELS): shapes come out too flat or too deep")
+            notes.append(
+                f"the focal length is not known; {focal:.0f} pixels are assumed (--focal PIXELS): shapes come out too flat or too deep"
+            )
     f = float(focal if focal is not None else known)
     scale = min(1.0, (max_side or max(w, h)) / max(w, h))
     size = (max(1, round(w * scale)), max(1, round(h * scale)))
@@ -186,7 +188,11 @@ def _from_cutouts(folder: Path, shape: tuple[int, int]) -> np.ndarray:
     for k, file in enumerate(sorted(folder.glob("*.png")), 1):
         data = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         if data is None or data.ndim != 3 or data.shape[2] != 4 or data.shape[:2] != shape:
-            have = "unreadable" if data is None else f"{data.shape[1]} x {data.shape[0]} pixels, {1 if data.ndim == 2 else data.shape[2]} channels"
+            have = (
+                "unreadable"
+                if data is None
+                else f"{data.shape[1]} x {data.shape[0]} pixels, {1 if data.ndim == 2 else data.shape[2]} channels"
+            )
             raise UserError(
                 f"a cut-out does not fit the photo: {have}; the photo has {shape[1]} x {shape[0]} pixels",
                 "where the object stands in the photo would be unknown",
@@ -261,7 +267,9 @@ def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[s
         raise UserError("the labels hold no object: they are black all over", fix=f"give each object a grey level or colour: {source}")
     large = objects & (areas >= LEAST_SIDE**2 / 4)
     if large.sum() > MOST or (objects.sum() > 3 * MOST and large.sum() == 0):
-        raise UserError(f"the label image holds {int(objects.sum())} values", "it is a photograph, not labels", f"one value per object: {source}")
+        raise UserError(
+            f"the label image holds {int(objects.sum())} values", "it is a photograph, not labels", f"one value per object: {source}"
+        )
     typical = np.median(areas[large]) if large.any() else 0
     keep = large & (areas >= 0.02 * typical)
     boxes = [np.nonzero(index == k) for k in np.flatnonzero(keep)]
@@ -270,7 +278,9 @@ def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[s
             keep[k] = False
     gone = int((objects & ~keep).sum())
     if not keep.any():
-        raise UserError(f"every object is smaller than {LEAST_SIDE} pixels", "so few pixels carry no pose", f"take a larger photo: {source}")
+        raise UserError(
+            f"every object is smaller than {LEAST_SIDE} pixels", "so few pixels carry no pose", f"take a larger photo: {source}"
+        )
     if gone:
         notes.append(f"{gone} labels cover less than {LEAST_SIDE} pixels, or next to nothing beside the others, and are left out")
     if keep.sum() == 1:

@@ -8,13 +8,12 @@
     truth/test/t_000.exr ...      novel views of the whole pile, with _albedo, _roughness, _metallic, _normal, _labels
     truth/relight/LIGHT.exr  truth/relight/LIGHT/t_000.exr ...
 
-World: +Y up, the ground is y = 0, every object's bounding sphere has the radius RADIUS. Objects come to rest on a facet of their convex hull, lean
-a little, and drop one after the other to where they first touch what lies there.
+World: +Y up, the ground is y = 0, every object's bounding sphere has the radius RADIUS. Objects come to rest on a facet of their convex
+hull, lean a little, and drop one after the other to where they first touch what lies there.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,7 +50,7 @@ def synthesize_duplicates(
     seed: int = 0,
     lean: float = 12.0,
     spread: float = 1.0,
-    part: int | None = None,
+    nodes: Sequence[str] = (),
     roughness: float | None = None,
     metallic: float | None = None,
     max_depth: int = 5,
@@ -59,8 +58,8 @@ def synthesize_duplicates(
 ) -> Path:
     """Render one photo of `count` copies of an object under one light, with its truth, into `out`; returns `out`.
 
-    lean: standard deviation in degrees of the tilt away from the resting pose. spread: factor on the radius of the pile. part: of a file with
-    several separate parts the one to take, counted by area from the largest. Others: as `synthesize_multiview`. Deterministic by `seed`; a
+    lean: standard deviation in degrees of the tilt away from the resting pose. spread: factor on the radius of the pile. nodes: names of
+    the glTF nodes whose meshes are taken, all where empty. Others: as `synthesize_multiview`. Deterministic by `seed`; a
     call with the same settings takes up where a stopped one was. Raises UserError when a file cannot be read or a number makes no sense.
     """
     options = {k: v for k, v in locals().items() if k in synthesize_duplicates.__kwdefaults__ and k not in ("say", "relights")}
@@ -76,8 +75,7 @@ def synthesize_duplicates(
     from relit.rendering.mitsuba_scene import build_scene, render, render_channels
     from relit.rendering.pile import build_pile, instance_ids
 
-    mesh, material = read_asset_file(asset_file)
-    mesh = mesh if part is None else largest_part(mesh, part)
+    mesh, material = read_asset_file(asset_file, nodes)
     material = _override(material, roughness, metallic)
     poses, reach = heap(mesh, count, seed, lean, spread)
     ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 5 * reach, np.array(GROUND_COLOUR), GROUND_ROUGHNESS)
@@ -150,6 +148,7 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
             raise UserError(f"no {what} file: {file}", fix=f"give an existing {'GLB or OBJ' if what == 'asset' else 'HDR or EXR'} file")
     defaults = synthesize_duplicates.__kwdefaults__
     plain = {key: options.get(key, value) for key, value in defaults.items() if key not in ("relights", "say")}
+    plain["nodes"] = list(plain["nodes"])
     identities = {what: _identity(file) for what, file in files.items()}
     return {"version": VERSION, "kind": "duplicates", **identities, "relights": [_identity(r) for r in relights], **plain}
 
@@ -167,24 +166,6 @@ def _check(o: dict, relights: list[Path]) -> None:
 
 
 # ---------------------------------------------------------------- the pile
-
-
-def largest_part(mesh: Mesh, rank: int) -> Mesh:
-    """The connected part of a mesh with the rank-th largest area (0 = largest); vertices doubled along seams count as one."""
-    import trimesh
-
-    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    _, same = np.unique(np.round(mesh.vertices / (np.ptp(mesh.vertices) * 1e-6)), axis=0, return_inverse=True)
-    groups = trimesh.graph.connected_component_labels(
-        trimesh.graph.face_adjacency(same.reshape(-1)[mesh.faces]), node_count=len(mesh.faces)
-    )
-    areas = np.bincount(groups, merged.area_faces)
-    if rank >= len(areas):
-        raise UserError(f"the model has {len(areas)} separate parts, part {rank} is not there", code=2)
-    faces = mesh.faces[groups == np.argsort(-areas, kind="stable")[rank]]
-    used, index = np.unique(faces, return_inverse=True)
-    take = lambda a: None if a is None else np.asarray(a)[used]  # noqa: E731
-    return Mesh(mesh.vertices[used], index.reshape(faces.shape).astype(np.int32), take(mesh.normals), take(mesh.uvs))
 
 
 def heap(mesh: Mesh, count: int, seed: int, lean: float, spread: float) -> tuple[list[np.ndarray], float]:
@@ -280,7 +261,9 @@ def visible_shares(mesh, material, poses, labels: np.ndarray, camera: Camera) ->
     from relit.rendering.pile import build_pile, instance_ids
 
     side = max(64, camera.width // 4)
-    wide = Camera(2 * side, 2 * side, camera.fx * side / camera.width, camera.fx * side / camera.width, side, side, camera.world_from_camera)
+    wide = Camera(
+        2 * side, 2 * side, camera.fx * side / camera.width, camera.fx * side / camera.width, side, side, camera.world_from_camera
+    )
     shares = []
     for k, pose in enumerate(poses):
         alone = build_pile(mesh, material, [pose])
@@ -302,11 +285,3 @@ def _write_mesh(path: Path, mesh: Mesh) -> None:
     from relit.images import write_bytes
 
     write_bytes(path, trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply"))
-
-
-def read_truth(folder: str | Path) -> dict[str, Any]:
-    """The content of truth.json. Raises UserError where the folder holds no finished truth."""
-    file = Path(folder) / "truth" / "truth.json"
-    if not file.is_file():
-        raise UserError("the folder holds no complete truth", fix=f"make one with `relit synthesize duplicates`: {folder}")
-    return json.loads(file.read_text())

@@ -27,7 +27,8 @@ OFFSET = 1e-3  # of the unit frame, along the normal
 
 
 class TraceableMesh:
-    """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray queries."""
+    """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray queries. Faces whose uvs are below -.5
+    carry no texels: they only block (the ground of a photo of duplicates)."""
 
     def __init__(self, mesh: Mesh, radiance: np.ndarray):
         self.scene = build_geometry(mesh)
@@ -74,7 +75,8 @@ def first_hits(mesh: TraceableMesh, o, d) -> Points:
         along = dr.select(hit & (length > 1e-6), along / dr.maximum(length, 1e-6), mi.Frame3f(n).s)
         across = dr.select(t.w < 0, -1.0, 1.0) * dr.cross(n, along)
         geometric = dr.select(hit, mi.Vector3f(si.n), mi.Vector3f(0, 0, 1))
-        return Points(hit & (dr.dot(si.n, d) < 0), x, n, geometric, -mi.Vector3f(d), uv, along, across)
+        seen = hit & (dr.dot(si.n, d) < 0) & (uv.x > -0.5)
+        return Points(seen, x, n, geometric, -mi.Vector3f(d), uv, along, across)
 
 
 def bent_normal(points: Points, slope):

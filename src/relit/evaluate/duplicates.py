@@ -1,0 +1,283 @@
+"""Figures of a photo of duplicates: poses, shape, material, light and the pile under other lights, against the truth of a synthetic
+capture.
+
+The photo's camera is known, so the reconstruction differs from the truth by one scale about that camera (a photo does not know it) and by
+the choice of the object's own frame. The frame is the one that agrees best with all registered instances.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from relit.cameras.se3 import nearest_rotation, rotation_angle
+from relit.conventions import move_points, scale_of, similarity, world_from_cv_camera
+from relit.errors import UserError
+from relit.evaluate import metrics as m
+from relit.scene import Asset, Camera, Ground
+
+VISIBLE = 0.25  # share of an instance that must be seen for it to count among those to be registered
+SAMPLES = 30_000
+MASKED = f"pixels of the objects (truth coverage >= {m.MASK}) in novel views of the whole pile; a pixel without a prediction is black"
+DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
+    "rotation_median": (
+        "degrees",
+        "median over registered instances of the rotation error, after the one turn of the object's frame that fits all",
+    ),
+    "rotation_pairs": ("degrees", "median over pairs of registered instances of the error of their relative rotation"),
+    "rotation_worst": ("degrees", "largest of the errors of which rotation_median is the median"),
+    "rotation_before": ("degrees", "rotation_median of the poses before the joint refinement with shape and appearance"),
+    "pairs_before": ("degrees", "rotation_pairs of the poses before the joint refinement"),
+    "translation_median": (
+        "radii",
+        "median distance of the objects' centres from the true ones after the one scale about the camera, in radii",
+    ),
+    "registered": ("%", f"share of the instances of which {VISIBLE:.0%} or more are visible that are registered within 10 degrees"),
+    "albedo_psnr": ("dB", f"base colour, one factor per channel over all test views, sRGB-encoded, {MASKED}; mean of the per-view PSNR"),
+    "roughness_mse": ("", f"perceptual roughness, {MASKED}"),
+    "metallic_mse": ("", f"metallic, {MASKED}"),
+    "novel_psnr": ("dB", f"the pile under the recovered light, sRGB-encoded, {MASKED}; mean of the per-view PSNR"),
+    "relit_psnr": (
+        "dB",
+        f"the pile under unseen lights, base colour times the factors of albedo_psnr, sRGB-encoded, {MASKED}; mean over lights, views",
+    ),
+    "environment_mse": (
+        "",
+        "recovered against true light, lat-long 256x512, clipped to [0, 1], to the power 1/2.2, mean of all texels (SfD)",
+    ),
+    "environment_mse_scaled": ("", "as environment_mse, the recovered light divided by the factors of albedo_psnr first"),
+    "chamfer": (
+        "radii",
+        "mean of the two mean distances between points of both whole surfaces after a similarity (ICP), in radii of the true object",
+    ),
+    "photo_psnr": ("dB", "the photo re-rendered with its own camera and light, sRGB-encoded, over the pixels of registered instances"),
+}
+
+
+def is_duplicates_truth(folder: str | Path) -> bool:
+    """Whether `relit synthesize duplicates` made the folder."""
+    file = Path(folder) / "truth" / "settings.json"
+    try:
+        return json.loads(file.read_text()).get("kind") == "duplicates"
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
+    """Every figure that the truth allows, as `evaluate.protocols.evaluate`. Raises UserError where the truth is unfinished."""
+    from relit.asset.asset import load_asset
+    from relit.images import read_data
+    from relit.rendering.mitsuba_scene import build_scene, render, render_channels
+    from relit.rendering.pile import build_pile
+
+    folder, asset = Path(truth_folder), load_asset(run)
+    if not (folder / "truth" / "truth.json").is_file():
+        raise UserError("the folder holds no complete truth", "its rendering was stopped", f"make it again: {folder}")
+    truth = json.loads((folder / "truth" / "truth.json").read_text())
+    cameras = read_cameras(folder / "transforms_test.json")
+    photo = read_cameras(folder / "transforms_train.json")[0][1]
+    true_poses = {i["label"]: np.array(i["world_from_object"]) for i in truth["instances"]}
+    poses = {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
+    values = pose_figures(poses, true_poses, {i["label"]: i["visible"] for i in truth["instances"]})
+    before = poses_before(Path(run), photo, list(poses))
+    if len(before) == len(poses):
+        earlier = pose_figures(before, true_poses, {})
+        values["rotation_before"], values["pairs_before"] = earlier["rotation_median"], earlier["rotation_pairs"]
+
+    import trimesh
+
+    loaded = trimesh.load(folder / "truth" / "mesh.ply", process=False)
+    true_points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).points
+    scale, frame = scene_alignment(poses, true_poses, photo, true_points, asset)
+    radius = truth["radius"]
+    values["translation_median"] = centre_error(poses, true_poses, photo, scale, frame, true_points) / radius
+    own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
+    values["chamfer"] = chamfer(true_points, own, frame)
+
+    moved = [grown_about(photo.centre, scale) @ p for p in poses.values()]
+    ground = None if asset.ground is None else scaled_ground(asset.ground, photo.centre, scale)
+    per_view: dict[str, dict[str, float]] = {name: {} for name, _ in cameras}
+
+    def scene_under(material, light):
+        pile = build_pile(asset.mesh, material, moved, ground)
+        return build_scene(pile.mesh, pile.material, np.eye(4), light)
+
+    scene = scene_under(asset.material, asset.environment)
+    objects = build_pile(asset.mesh, asset.material, moved)
+    bare = build_scene(objects.mesh, objects.material, np.eye(4), None)  # channels of the objects alone
+    predicted, reference = {}, {}
+    for name, camera in cameras:
+        predicted[name] = render_channels(bare, camera, spp=16)
+        reference[name] = read_data(folder / "truth" / "test" / f"{name}_albedo.exr")
+    inside = {name: r[..., 3] >= m.MASK for name, r in reference.items()}
+    both = {name: inside[name] & (predicted[name]["alpha"] > 0) for name in inside}
+    factor = m.albedo_scale(
+        np.concatenate([predicted[n]["albedo"][both[n]] for n in both]), np.concatenate([reference[n][..., :3][both[n]] for n in both])
+    )
+    for i, (name, camera) in enumerate(cameras):
+        p, where = predicted[name], inside[name]
+        for key in ("roughness", "metallic"):
+            t = read_data(folder / "truth" / "test" / f"{name}_{key}.exr")
+            per_view[name][f"{key}_mse"] = float(np.square(p[key] - t)[where].mean())
+        per_view[name]["albedo_psnr"] = m.psnr(m.encode(p["albedo"] * factor), m.encode(reference[name][..., :3]), where)
+        picture = read_data(folder / "truth" / "test" / f"{name}.exr")
+        shown = render(scene, camera, spp=spp, seed=seed + i)[..., :3] * (p["alpha"] > 0)[..., None]
+        per_view[name]["novel_psnr"] = m.psnr(m.encode(shown), m.encode(picture[..., :3]), where)
+    scaled = replace(asset.material, base_color=np.clip(asset.material.base_color * factor, 0, 1).astype(np.float32))
+    for light_name in truth["relight"]:
+        scene = scene_under(scaled, read_data(folder / "truth" / "relight" / f"{light_name}.exr")[..., :3])
+        for i, (name, camera) in enumerate(cameras):
+            picture = read_data(folder / "truth" / "relight" / light_name / f"{name}.exr")
+            shown = render(scene, camera, spp=spp, seed=seed + i)[..., :3] * (predicted[name]["alpha"] > 0)[..., None]
+            per_view[name][f"relit_psnr:{light_name}"] = m.psnr(m.encode(shown), m.encode(picture[..., :3]), inside[name])
+    light = read_data(folder / "truth" / "environment.exr")[..., :3]
+    values["environment_mse"] = m.environment_mse(asset.environment, light)
+    values["environment_mse_scaled"] = m.environment_mse(asset.environment / factor, light)
+    values["photo_psnr"] = photo_figure(asset, folder, spp=spp, seed=seed)
+    names = {key for view in per_view.values() for key in view}
+    for key in {k.split(":")[0] for k in names}:
+        values[key] = float(np.mean([v for view in per_view.values() for k, v in view.items() if k.split(":")[0] == key]))
+    return {
+        "metrics": {
+            k: {"value": float(values[k]), "unit": u, "definition": d} for k, (u, d) in DUPLICATES_DEFINITIONS.items() if k in values
+        },
+        "per_view": per_view,
+        "albedo_scale": [float(x) for x in factor],
+        "alignment": "scale about the camera",
+    }
+
+
+def photo_figure(asset: Asset, capture: Path, *, spp: int = 64, seed: int = 0) -> float:
+    """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr)."""
+    from relit.capture.sfd import open_duplicates, recognise
+    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.rendering.pile import build_pile
+
+    source = recognise(capture)
+    if source is None or not asset.cameras:
+        raise UserError("the capture is no photo of duplicates", fix=f"give the folder that the run was made from: {capture}")
+    camera = asset.cameras[0][1]
+    pixels = open_duplicates(source, focal=camera.fx).photos[0].load()
+    pile = build_pile(asset.mesh, asset.material, [i.world_from_object for i in asset.instances if i.registered], asset.ground)
+    picture = render(build_scene(pile.mesh, pile.material, np.eye(4), asset.environment), camera, spp=spp, seed=seed)
+    where = np.isin(pixels.labels, [i.label for i in asset.instances if i.registered])
+    return m.psnr(m.encode(picture[..., :3]), m.encode(pixels.rgb), where)
+
+
+def read_cameras(file: Path) -> list[tuple[str, Camera]]:
+    """(name, Camera) pairs of a transforms file with one focal length."""
+    data = json.loads(file.read_text())
+    w, h, f = data["w"], data["h"], float(data["focal"])
+    return [
+        (Path(x["file_path"]).stem, Camera(w, h, f, f, w / 2, h / 2, world_from_cv_camera(np.array(x["transform_matrix"], np.float64))))
+        for x in data["frames"]
+    ]
+
+
+# ---------------------------------------------------------------- poses
+
+
+def object_turn(poses: dict, true_poses: dict) -> np.ndarray:
+    """(3, 3) object_from_true_object: the turn of the object's frame that most registered instances agree on."""
+    turns = np.array([nearest_rotation(poses[k][:3, :3]).T @ nearest_rotation(true_poses[k][:3, :3]) for k in poses])
+    angles = np.array([[rotation_angle(a.T @ b) for b in turns] for a in turns])
+    middle = int(np.argmin(np.median(angles, axis=1)))
+    near = angles[middle] <= max(3 * float(np.median(angles[middle])), 1.0)
+    return nearest_rotation(turns[near].sum(0))
+
+
+def pose_figures(poses: dict, true_poses: dict, visible: dict) -> dict[str, float]:
+    """rotation_median, rotation_worst, rotation_pairs and, where the visible shares are known, registered."""
+    keys = [k for k in poses if k in true_poses]
+    poses = {k: poses[k] for k in keys}
+    if not keys:
+        raise UserError("no registered instance has a label of the truth", fix="is this the capture that the run was made from?")
+    turn = object_turn(poses, true_poses)
+    a = {k: nearest_rotation(poses[k][:3, :3]) @ turn for k in keys}
+    b = {k: nearest_rotation(true_poses[k][:3, :3]) for k in keys}
+    errors = {k: rotation_angle(a[k].T @ b[k]) for k in keys}
+    pairs = [rotation_angle((a[i] @ a[j].T).T @ (b[i] @ b[j].T)) for n, i in enumerate(keys) for j in keys[:n]]
+    out = {"rotation_median": float(np.median(list(errors.values()))), "rotation_worst": max(errors.values())}
+    out["rotation_pairs"] = float(np.median(pairs)) if pairs else 0.0
+    asked = [k for k, v in visible.items() if v >= VISIBLE]
+    if asked:
+        out["registered"] = 100.0 * float(np.mean([errors.get(k, 180.0) < 10 for k in asked]))
+    return out
+
+
+def poses_before(run: Path, photo: Camera, labels: list[int]) -> dict[int, np.ndarray]:
+    """world_from_object of the given labels as the pose search has left them; {} for an asset without its run."""
+    from relit.files import load_arrays
+
+    file = run / "stages" / "poses" / "poses.npz"
+    if not file.is_file():
+        return {}
+    saved = load_arrays(file)
+    found = {int(k): p for k, p in zip(saved["labels"], saved["poses"], strict=True)}
+    return {k: photo.world_from_camera @ np.linalg.inv(found[k]) for k in labels if k in found}
+
+
+def grown_about(centre: np.ndarray, scale: float) -> np.ndarray:
+    """(4, 4) scaling about a point."""
+    return similarity(np.eye(3), np.asarray(centre) * (1 - scale), scale)
+
+
+def scaled_ground(g: Ground, centre: np.ndarray, scale: float) -> Ground:
+    return replace(g, point=move_points(grown_about(centre, scale), g.point), radius=g.radius * scale)
+
+
+def scene_alignment(poses: dict, true_poses: dict, photo: Camera, true_points: np.ndarray, asset: Asset) -> tuple[float, np.ndarray]:
+    """Scale about the camera that carries the recovered scene onto the true one, and object_from_true_object (4, 4) with the turn of
+    `object_turn`, refined between the surfaces (ICP)."""
+    turn = object_turn(poses, true_poses)
+    middle = (true_points.min(0) + true_points.max(0)) / 2
+    own = (asset.mesh.vertices.min(0) + asset.mesh.vertices.max(0)) / 2
+    ratios = [
+        np.linalg.norm(move_points(true_poses[k], middle) - photo.centre) / np.linalg.norm(move_points(poses[k], own) - photo.centre)
+        for k in poses
+        if k in true_poses
+    ]
+    size = np.ptp(asset.mesh.vertices, axis=0).max() / np.ptp(true_points, axis=0).max()
+    frame = similarity(turn, own - size * turn @ middle, size)
+    frame = icp(true_points[::10], asset.mesh.vertices.astype(np.float64), frame)
+    scale = float(np.median(ratios))
+    sizes = [scale_of(true_poses[k]) / (scale_of(poses[k]) * scale_of(frame)) for k in poses if k in true_poses]
+    return float(np.sqrt(scale * np.median(sizes))), frame
+
+
+def icp(source: np.ndarray, target: np.ndarray, start: np.ndarray, rounds: int = 30) -> np.ndarray:
+    """Similarity (4, 4) that carries points onto points, from `start`; nearest neighbours, the farthest tenth left out."""
+    from scipy.spatial import cKDTree
+
+    from relit.cameras.se3 import umeyama
+
+    tree, frame = cKDTree(target), start
+    for _ in range(rounds):
+        moved = move_points(frame, source)
+        distance, index = tree.query(moved)
+        keep = distance <= np.quantile(distance, 0.9)
+        frame = umeyama(source[keep], target[index[keep]])
+    return frame
+
+
+def centre_error(poses, true_poses, photo: Camera, scale: float, frame: np.ndarray, true_points: np.ndarray) -> float:
+    middle = (true_points.min(0) + true_points.max(0)) / 2
+    grow = grown_about(photo.centre, scale)
+    distances = [
+        np.linalg.norm(move_points(grow @ poses[k] @ frame, middle) - move_points(true_poses[k], middle)) for k in poses if k in true_poses
+    ]
+    return float(np.median(distances))
+
+
+def chamfer(true_points: np.ndarray, own: np.ndarray, frame: np.ndarray) -> float:
+    """Mean of the two mean nearest distances between samples, in radii of the true object."""
+    from scipy.spatial import cKDTree
+
+    back = move_points(np.linalg.inv(frame), own)
+    radius = np.linalg.norm(true_points - (true_points.min(0) + true_points.max(0)) / 2, axis=1).max()
+    one, two = cKDTree(true_points).query(back)[0].mean(), cKDTree(back).query(true_points)[0].mean()
+    return float((one + two) / 2 / radius)

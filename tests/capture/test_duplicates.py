@@ -1,0 +1,166 @@
+"""Photos of duplicates: layouts, labels, and what is wrong with them."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from relit.capture import open_capture
+from relit.capture.sfd import _run_lengths, _uncompressed
+from relit.errors import UserError
+
+W, H = 160, 96
+
+
+def labels_of(count=3):
+    out = np.zeros((H, W), np.uint8)
+    for k in range(count):
+        cv2.circle(out, (30 + 48 * k, 48), 18, 60 + 40 * k, -1)
+    return out
+
+
+def photo(folder, name="photo.png"):
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = np.random.default_rng(0).integers(0, 255, (H, W, 3), np.uint8)
+    cv2.imwrite(str(folder / name), picture)
+    return folder / name
+
+
+def sfd(folder, focal="123.5"):
+    photo(folder / "train", "000_rgb.png")
+    cv2.imwrite(str(folder / "train" / "000_instance_seg.png"), labels_of())
+    pose = np.eye(4)
+    pose[:3, 3] = [1, 2, 3]
+    frames = [{"file_path": "train/000", "transform_matrix": pose.tolist()}]
+    (folder / "transforms_train.json").write_text(json.dumps({"focal": focal, "frames": frames}))
+    return folder
+
+
+def numbers(capture):
+    return np.unique(capture.photos[0].load().labels).tolist()
+
+
+def test_sfd_folder_with_focal_as_text_and_a_photo_that_is_not_square(tmp_path):
+    capture = open_capture(sfd(tmp_path / "c"))
+    camera = capture.photos[0].camera
+    assert capture.kind == "duplicates" and (camera.width, camera.height) == (W, H)
+    assert camera.fx == 123.5 and camera.cx == W / 2
+    assert np.allclose(camera.centre, [1, 2, 3]) and np.allclose(camera.world_from_camera[:3, 2], [0, 0, -1])
+    assert numbers(capture) == [0, 60, 100, 140]
+
+
+def test_a_focal_length_from_the_command_line_wins(tmp_path):
+    assert open_capture(sfd(tmp_path / "c"), focal=200.0).photos[0].camera.fx == 200.0
+
+
+def test_a_senseless_focal_length_is_named(tmp_path):
+    with pytest.raises(UserError, match="focal"):
+        open_capture(sfd(tmp_path / "c", focal="wide"))
+
+
+def test_a_photo_with_coloured_labels_beside_it(tmp_path):
+    path = photo(tmp_path)
+    grey = labels_of()
+    colours = np.stack([grey, grey // 2, np.where(grey > 0, 200, 0).astype(np.uint8)], -1)
+    cv2.imwrite(str(tmp_path / "photo_labels.png"), colours)
+    capture = open_capture(path)
+    assert len(numbers(capture)) == 4 and any("focal length is not known" in n for n in capture.notes)
+    assert open_capture(tmp_path).kind == "duplicates"
+
+
+def test_shrunk_photos_keep_their_label_numbers(tmp_path):
+    capture = open_capture(sfd(tmp_path / "c"), max_side=80)
+    assert capture.photos[0].width == 80 and numbers(capture) == [0, 60, 100, 140]
+    assert capture.photos[0].camera.fx == pytest.approx(123.5 / 2)
+
+
+def test_labels_of_another_shape_are_refused(tmp_path):
+    path = photo(tmp_path)
+    cv2.imwrite(str(tmp_path / "photo_labels.png"), labels_of()[:, :80])
+    with pytest.raises(UserError, match="another shape"):
+        open_capture(path)
+
+
+def test_labels_of_another_size_are_resampled(tmp_path):
+    path = photo(tmp_path)
+    big = cv2.resize(labels_of(), (2 * W, 2 * H), interpolation=cv2.INTER_NEAREST)
+    cv2.imwrite(str(tmp_path / "photo_labels.png"), big)
+    assert numbers(open_capture(path)) == [0, 60, 100, 140]
+
+
+def test_tiny_objects_are_left_out_and_black_labels_refused(tmp_path):
+    path = photo(tmp_path)
+    labels = labels_of()
+    labels[2:8, 2:8] = 17
+    cv2.imwrite(str(tmp_path / "photo_labels.png"), labels)
+    capture = open_capture(path)
+    assert 17 not in numbers(capture) and any("left out" in n for n in capture.notes)
+    cv2.imwrite(str(tmp_path / "photo_labels.png"), np.where(labels == 17, 17, 0).astype(np.uint8))
+    with pytest.raises(UserError, match="smaller than 24"):
+        open_capture(path)
+    cv2.imwrite(str(tmp_path / "photo_labels.png"), np.zeros_like(labels))
+    with pytest.raises(UserError, match="no object"):
+        open_capture(path)
+
+
+def test_one_object_and_objects_cut_by_the_border_are_noted(tmp_path):
+    path = photo(tmp_path)
+    labels = np.zeros((H, W), np.uint8)
+    cv2.circle(labels, (5, 48), 30, 90, -1)
+    cv2.imwrite(str(tmp_path / "photo_labels.png"), labels)
+    notes = " ".join(open_capture(path).notes)
+    assert "only one object" in notes and "cut by the photo's border" in notes
+
+
+def test_cutouts(tmp_path):
+    path = photo(tmp_path)
+    (tmp_path / "cutouts").mkdir()
+    for k, value in enumerate((60, 100)):
+        alpha = np.where(labels_of() == value, 255, 0).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / "cutouts" / f"{k}.png"), np.dstack([np.zeros((H, W, 3), np.uint8), alpha]))
+    assert numbers(open_capture(path)) == [0, 1, 2]
+    cv2.imwrite(str(tmp_path / "cutouts" / "2.png"), np.zeros((20, 20, 4), np.uint8))
+    with pytest.raises(UserError, match="does not fit the photo"):
+        open_capture(path)
+
+
+def test_coco_polygons_and_run_lengths(tmp_path):
+    path = photo(tmp_path)
+    mask = (labels_of() == 100).astype(np.uint8)
+    flat = mask.T.ravel()
+    change = np.flatnonzero(np.diff(flat)) + 1
+    runs = np.diff(np.concatenate([[0], change, [len(flat)]])).tolist()
+    annotations = [
+        {"image_id": 7, "segmentation": [[12, 30, 48, 30, 48, 66, 12, 66]]},
+        {"image_id": 7, "segmentation": {"size": [H, W], "counts": runs}},
+        {"image_id": 8, "segmentation": [[100, 30, 148, 30, 148, 66]]},
+    ]
+    images = [{"id": 7, "file_name": "photo.png", "width": W, "height": H}, {"id": 8, "file_name": "other.png"}]
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    labels = open_capture(path).photos[0].load().labels
+    assert ((labels == 2) == (mask > 0)).all() and labels[48, 30] == 1 and set(np.unique(labels)) == {0, 1, 2}
+    annotations[1]["segmentation"]["counts"] = [5, 5]
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    with pytest.raises(UserError, match="no usable segmentation"):
+        open_capture(path)
+
+
+def test_compressed_run_lengths():
+    def compressed(runs):  # COCO's rleToString
+        out = ""
+        for i, run in enumerate(runs):
+            x = run - runs[i - 2] if i > 2 else run
+            more = True
+            while more:
+                c, x = x & 31, x >> 5
+                more = x != -1 if c & 16 else x != 0
+                out += chr((c | 32 if more else c) + 48)
+        return out
+
+    runs = [3, 40, 2, 55, 1, 700, 5, 9]
+    assert _uncompressed(compressed(runs)) == runs
+    mask = _run_lengths({"size": [5, sum(runs) // 5], "counts": compressed(runs)})
+    assert mask.T.ravel()[:3].sum() == 0 and mask.T.ravel()[3:43].all()
