@@ -19,7 +19,7 @@ import numpy as np
 from relit.capture.samurai import read_hints
 from relit.conventions import similarity
 from relit.errors import UserError, did_you_mean
-from relit.fit.collection_poses import GREY, Schedule, even_colours, find_poses
+from relit.fit.collection_poses import GREY, even_colours, find_poses, schedule_of
 from relit.fit.collection_surface import LightOptions, fit_collection_surface, posterior, start_collection_surface
 from relit.fit.multiview import resize, run_arrays, vertex_areas
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras
@@ -56,24 +56,26 @@ FINDS_CAMERAS = True
 LEAST_PHOTOS = 4
 COST = {"draft": (150.0, 1.2e9), "standard": (700.0, 2.0e9), "high": (2500.0, 3.0e9)}
 FIELD = 50.0  # degrees along the longer side, where EXIF tells nothing
-FAILED = 0.90  # mean score of the registration below which the poses are taken for wrong
 WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "light_prior")
 
 
 @dataclass(frozen=True)
 class CollectionOptions:
-    """side: pixels of the photos' longer side. keep: hypotheses of each photo that are refined (SAMURAI's multiplex). hints: whether
-    quadrants or angles are used. holdout: every so many photos are set aside (0: none but those of held_out.json). starts: photos that
-    growth begins from without hints. levels, level_steps, rays: of the volume pass. refine_cameras: step of the camera corrections in it.
-    faces, texture, surface_steps, points, directions: of mesh and surface pass. frozen_steps: of the fit of held-out photos. without: what
-    an ablation switches off.
+    """side: pixels of the photos' longer side. rounds: of coarse fit and registration. keep: hypotheses of each photo that are refined
+    (SAMURAI's multiplex). hints: whether quadrants or angles are used. holdout: every so many photos are set aside (0: none but those of
+    held_out.json). starts: photos that growth begins from without hints. least_score: of the registration, on average, below which
+    the poses are taken for wrong. levels, level_steps, rays: of the volume pass. refine_cameras:
+    step of the camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass. frozen_steps: of the
+    fit of held-out photos. without: what an ablation switches off.
     """
 
     side: int = 400
+    rounds: int = 6
     keep: int = 3
     hints: bool = True
     holdout: int = 0
     starts: int = 4
+    least_score: float = 0.9
     levels: tuple[int, ...] = (64, 128)
     level_steps: tuple[int, ...] = (400, 500)
     rays: int = 6144
@@ -226,31 +228,33 @@ def pose_stage(shots: list[Shot], degrees: float, run, options: CollectionOption
         with run.stage("poses", title="where the photos were taken from") as stage:
             crops, hints = crops_of(shots), np.array([s.direction for s in shots])
             try:
-                poses, scores = find_poses(crops, hints, degrees, Schedule(), options.keep, options.starts, options.without, seed, run.say)
+                poses, scores = find_poses(
+                    crops, hints, degrees, schedule_of(options.rounds), options.keep, options.starts, options.without, seed, run.say
+                )
             except ValueError as error:
                 why = f"{error}: the masks belong to different objects, or are wrong"
                 raise UserError("no shape agrees with the photos", why, "look at the masks (relit inspect)", code=4) from None
             kept = {"poses": poses, "scores": scores}
             stage.save("poses", **kept)
-        judge_poses(kept["scores"], shots, run)
+        judge_poses(kept["scores"], shots, options.least_score, run)
     poses, scores = kept["poses"], kept["scores"]
     loss = 1 - scores
     weights = np.ones(len(shots)) if "posterior" in options.without else posterior(loss, [*loss, *loss][:1000] * (20 // len(loss) + 1))
     return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)], weights
 
 
-def judge_poses(scores: np.ndarray, shots: list[Shot], run) -> None:
+def judge_poses(scores: np.ndarray, shots: list[Shot], least: float, run) -> None:
     """Say how well the photos agree, and which do not. Raises UserError (code 4) when the poses are wrong as a whole."""
     mean = float(np.mean(scores))
-    run.say(f"mean score of the registration {mean:.3f} (1 is perfect; below {FAILED} is a failure)")
+    run.say(f"mean score of the registration {mean:.3f} (1 is perfect; below {least} is a failure)")
     worst = np.argsort(scores)
     low = [k for k in worst if scores[k] < np.median(scores) - 4 * max(float(np.median(np.abs(scores - np.median(scores)))), 0.004)]
     if low:
         named = ", ".join(f"{shots[k].photo.name} ({scores[k]:.2f})" for k in low[:5])
         run.say(f"note: {len(low)} photos agree badly with the others (another object, a wrong mask or a wrong pose): {named}")
-    if mean < FAILED:
+    if mean < least:
         raise UserError(
-            f"where the photos were taken from could not be found: they agree with no common shape (score {mean:.3f}, {FAILED} is needed)",
+            f"where the photos were taken from could not be found: they agree with no common shape (score {mean:.3f}, {least} is needed)",
             "too few photos, wrong masks, photos of different objects, quadrants of other photos, or an object alike from all sides",
             "look at the masks; answer `relit quadrants PHOTOS`; add photos between those that are far apart",
             code=4,

@@ -35,6 +35,7 @@ from relit.geometry.hull import distance_of, visual_hull
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
+HOPELESS = 0.8  # mean score of the first photos below which growth is given up
 HINT = 0.05  # weight of the hints' prior on scores in the first round, falling to 0
 SPREAD = 0.36  # root mean square radius of silhouettes, unit frame: the gauge of scale
 GREY = 0.3  # mean colour of every crop
@@ -49,6 +50,13 @@ class Schedule:
     steps: tuple[int, ...] = (60, 60, 80, 100, 120, 140)
     views: tuple[int, ...] = (300, 300, 400, 400, 500, 500)
     tolerance: tuple[float, ...] = (0.45, 0.35, 0.25, 0.2, 0.12, 0.1)
+
+
+def schedule_of(rounds: int) -> Schedule:
+    """The default schedule stretched or shortened to so many rounds."""
+    full = Schedule()
+    at = np.linspace(0, len(full.nodes) - 1, rounds).round().astype(int)
+    return Schedule(*(tuple(getattr(full, name)[i] for i in at) for name in ("nodes", "steps", "views", "tolerance")))
 
 
 class Quiet:
@@ -222,7 +230,9 @@ def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
     for photo in first:
         state = grow(crops, photo, early, seed, say, rings)
         tried.append((float(np.mean(np.sort(state[1])[-early[-1] :])), photo))
-    best = max(tried)[1]
+    score, best = max(tried)
+    if score < HOPELESS:
+        raise ValueError(f"from none of {len(tried)} photos could a shape be grown that others agree with (best score {score:.2f})")
     late = [min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2, 0.27, 0.37, 0.47, 0.57, 0.75, 1, 1, 1)]
     poses, _ = grow(crops, best, late, seed, say, rings)
     return settle(crops, poses, rings, keep, seed, say)
