@@ -152,7 +152,7 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
     assert len({count for _, _, count in late}) == 1
 
 
-NAMES = ["hull", "interreflection", "exchange", "material_prior", "colour_smoothing", "light_prior", "parsimony", "normal_map"]
+NAMES = ["hull", "interreflection", "exchange", "material_prior", "colour_smoothing", "light_prior", "white", "parsimony", "normal_map"]
 
 
 @pytest.mark.parametrize("without", NAMES)

@@ -87,6 +87,7 @@ MULTIVIEW = Suite(
         "material_prior": ("without=material_prior",),
         "colour_smoothing": ("without=colour_smoothing",),
         "light_prior": ("without=light_prior",),
+        "white": ("without=white",),
         "parsimony": ("without=parsimony",),
         "normal_map": ("without=normal_map",),
         "priors": ("without=material_prior,colour_smoothing,light_prior",),

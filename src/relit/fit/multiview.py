@@ -59,9 +59,9 @@ class MultiviewOptions:
     explore_steps: int = 400
     faces: int = 40_000
     texture: int = 512
-    surface_steps: int = 3500
+    surface_steps: int = 4500
     points: int = 4096
-    directions: int = 64
+    directions: int = 32
     light: int = 64
     without: tuple[str, ...] = ()
 
@@ -74,6 +74,7 @@ class MultiviewOptions:
 WITHOUT = {  # what an ablation switches off: settings of the surface pass
     "interreflection": {},  # what blocks a direction is black
     "exchange": {"exchange_rate": 0.0},
+    "white": {"bright": 0.0},
     "material_prior": {"smooth_roughness": 0.0, "smooth_metallic": 0.0, "metallic_binary": 0.0, "metallic_sparse": 0.0},
     "colour_smoothing": {"smooth_colour": 0.0},
     "light_prior": {"light_smooth": 0.0, "light_neutral": 0.0},

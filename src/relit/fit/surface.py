@@ -22,6 +22,7 @@ from relit.materials.field import MaterialField, material_at, project, slope_at,
 from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 
 ALBEDO_START = 0.4  # mean base colour at the start; light and albedo share one unknown scale
+WHITE = 0.8  # base colour of white paint and paper; what would have to be brighter rather stands in more light
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class SurfaceOptions:
     exchange_rate: of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of the steps over
     which colour_rate rises from a twentieth. roughness_start: first roughness. smooth_roughness, smooth_metallic, smooth_colour:
     weights of differences between similar neighbours, up to similarity_reach (unit frame) apart and similarity_width in base colour;
-    smooth_shade: power of `brightness` in smooth_colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. light_smooth: total
+    smooth_shade: power of `brightness` in smooth_colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. bright: of base colour beyond WHITE, squared. light_smooth: total
     variation of the log radiance. light_neutral: its chroma. parsimony, parsimony_width, parsimony_share: see `parsimony`. slope_rate,
     slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth: weights of `slope_prior`,
     whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise does not move it at
@@ -61,6 +62,7 @@ class SurfaceOptions:
     similarity_width: float = 0.1
     metallic_binary: float = 0.01
     metallic_sparse: float = 0.03
+    bright: float = 0.3
     light_smooth: float = 0.002
     light_neutral: float = 2e-4
     parsimony: float = 0.02
@@ -226,7 +228,8 @@ def material_prior(material: MaterialField, surface, near: Points, valid, option
         + colour_smoothing * (change.x + change.y + change.z) * w
     )
     m = surface.metallic
-    single = options.metallic_binary * m * (1 - m) + options.metallic_sparse * m
+    white = dr.maximum(mi.Vector3f(surface.base) - WHITE, 0)
+    single = options.metallic_binary * m * (1 - m) + options.metallic_sparse * m + options.bright * dr.squared_norm(white)
     return dr.mean(smooth * w) + dr.mean(dr.select(valid, single, 0))
 
 
