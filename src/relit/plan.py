@@ -19,7 +19,12 @@ KINDS = ("multiview", "flash", "duplicates", "collection")
 # The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture, run, options, seed) -> Asset.
 # and LIGHT (a phrase) and STAGES (names) for `relit inspect`. It may also hold FINDS_CAMERAS = True (photos without cameras come to it as
 # they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST (see MEASURED).
-RECIPES = {"multiview": "relit.fit.multiview"}
+RECIPES = {
+    "multiview": "relit.fit.multiview",
+    "flash": "relit.fit.flash",
+    "duplicates": "relit.fit.duplicates",
+    "collection": "relit.fit.collection",
+}
 QUALITIES = ("draft", "standard", "high")
 JOB_KEYS = {"capture": str, "quality": str, "seed": int, "masks": str, "max_side": int, "focal": float, "sphere": list}
 WRITTEN_KEYS = {"input", "relit", "settings"}  # what config.toml holds besides
@@ -77,7 +82,7 @@ def open_input(path: Path, job: Job) -> Capture:
 
     sphere = None if job.sphere is None else Sphere(np.array(job.sphere[:3], dtype=np.float64), float(job.sphere[3]))
     least = {} if job.capture not in RECIPES else {"min_photos": getattr(recipe_of(job.capture), "LEAST_PHOTOS", 3)}
-    return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side, **least)
+    return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side, focal=job.focal, **least)
 
 
 def open_as(path: Path, job: Job) -> tuple[Capture, str]:

@@ -173,8 +173,8 @@ class Material:
 class Flash:
     """A point light that moves with the camera (PIR Eq. 4): at camera_centre + world_from_camera offset.
 
-    offset: (3,) in OpenCV camera axes, world units. intensity: (3,) radiant intensity I, so that a white Lambertian surface facing the light
-    at distance d shows radiance I / (pi d^2) in linear pixels.
+    offset: (3,) in OpenCV camera axes, world units. intensity: (3,) radiant intensity I, so that a white Lambertian surface facing the
+    light at distance d shows radiance I / (pi d^2) in linear pixels.
     """
 
     offset: np.ndarray
@@ -218,8 +218,9 @@ class Asset:
     world_from_asset: (4, 4) similarity from the asset frame to the frame of `cameras` and `environment`.
     environment: (H, W, 3) float32 lat-long radiance in the world frame (Mitsuba's axes), or None.
     cameras: (name, Camera) pairs in the world frame. meta: what goes to asset.json besides.
-    flash: the light at the cameras of a flash capture, or None. instances, ground: of a photo of duplicates; world_from_asset is the pose of
-    one of the instances then. lights: of a collection: one environment (H, W, 3) for each of `cameras`, with the photo's exposure in it.
+    flash: the light at the cameras of a flash capture, or None. instances, ground: of a photo of duplicates; world_from_asset is the pose
+    of one of the instances then. lights: of a collection: one environment (H, W, 3) for each of `cameras`, with the photo's exposure in
+    it.
     """
 
     mesh: Mesh

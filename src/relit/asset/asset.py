@@ -1,6 +1,7 @@
 """The asset folder: what `reconstruct` leaves and everything after it reads.
 
     asset.json  object.glb  textures/{base_color,roughness,metallic,specular,normal}.png  cameras.json  lights/environment.{exr,hdr}
+    lights/flash.json
 
 Nothing in it is absolute: the folder can be moved. `object.glb` is the one source of shape and material; `textures/` holds copies of
 its images for other tools.
@@ -17,9 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from relit.asset.gltf import read_asset_file, write_glb
+from relit.asset.instances import read_instances, write_instances
 from relit.conventions import world_from_cv_camera, world_from_gl_camera
 from relit.errors import EXIT_ENVIRONMENT, UserError
 from relit.images import read_image, write_data, write_linear, write_srgb
+from relit.lighting.flash import flash_json, read_flash
 from relit.scene import Asset, Camera, Material
 
 SCHEMA = 1
@@ -138,6 +141,14 @@ def save_asset(folder: str | Path, asset: Asset) -> Path:
                 (new / "lights").mkdir()
                 write_linear(new / "lights" / "environment.exr", asset.environment)
                 write_linear(new / "lights" / "environment.hdr", asset.environment)
+            for i, light in enumerate(asset.lights):
+                (new / "lights").mkdir(exist_ok=True)
+                write_linear(new / "lights" / f"photo_{i:04d}.exr", light)
+            if asset.flash is not None:
+                (new / "lights").mkdir(exist_ok=True)
+                (new / "lights" / "flash.json").write_text(flash_json(asset.flash))
+            if asset.instances:
+                write_instances(new, asset)
             _write_json(new / "asset.json", head)
             _swap(new, folder)
         finally:
@@ -187,4 +198,9 @@ def load_asset(folder_or_run: str | Path) -> Asset:
     )
     environment = None if light is None else read_image(light).rgb
     cameras = read_cameras(folder / "cameras.json") if (folder / "cameras.json").is_file() else ()
-    return Asset(mesh, material, world_from_asset, environment, cameras, {k: v for k, v in head.items() if k not in RESERVED})
+    flash = read_flash(folder / "lights" / "flash.json") if (folder / "lights" / "flash.json").is_file() else None
+    files = [folder / "lights" / f"photo_{i:04d}.exr" for i in range(len(cameras))]
+    lights = tuple(read_image(f).rgb for f in files) if files and all(f.is_file() for f in files) else ()
+    meta = {k: v for k, v in head.items() if k not in RESERVED}
+    instances, ground = read_instances(folder)
+    return Asset(mesh, material, world_from_asset, environment, cameras, meta, flash, instances, ground, lights)

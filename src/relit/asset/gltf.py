@@ -22,11 +22,12 @@ FLOAT, UINT = 5126, 5125
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 
 
-def read_asset_file(path: str | Path) -> tuple[Mesh, Material]:
+def read_asset_file(path: str | Path, nodes=()) -> tuple[Mesh, Material]:
     """Mesh and material of a .glb, .gltf or .obj file, in the file's coordinates after its node transforms.
 
     Factors are multiplied into the textures, several primitives become one mesh, several materials one atlas. Vertex colours,
-    occlusion and emission are ignored. Raises UserError for a missing, damaged or unsupported file.
+    occlusion and emission are ignored. nodes: names of the glTF nodes whose meshes are taken; all where empty.
+    Raises UserError for a missing, damaged or unsupported file.
     """
     path = Path(path)
     if not path.is_file():
@@ -34,8 +35,10 @@ def read_asset_file(path: str | Path) -> tuple[Mesh, Material]:
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
         with np.errstate(all="ignore"):  # damaged files: values that are not finite are refused at the end
-            return read_gltf(path)
+            return read_gltf(path, tuple(nodes))
     if suffix == ".obj":
+        if nodes:
+            raise UserError("an OBJ file has no nodes to choose", fix=f"give none, or a .glb: {path}")
         return read_obj(path)
     raise UserError(f"'{suffix}' is not a model format that can be read", fix=f"use .glb, .gltf or .obj: {path}")
 
@@ -131,12 +134,13 @@ def _pbr(doc: _Document, m: Material) -> dict:
     return p
 
 
-def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=None, name: str = "object") -> None:
+def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=None, name: str = "object", instances=()) -> None:
     """Write a binary glTF 2.0 file, atomically: one node, one primitive, NORMAL always, TANGENT with a normal map.
 
     root_transform: (4, 4) matrix of the node, or None: the file's coordinates are root_transform @ mesh. Textures are 8-bit PNGs
     (base colour and specular colour in sRGB); an array with one value becomes a factor. Material.specular becomes specularColor of
-    KHR_materials_specular, an ior other than 1.5 becomes KHR_materials_ior.
+    KHR_materials_specular, an ior other than 1.5 becomes KHR_materials_ior. instances: (name, (4, 4)) pairs, one node for each, all with
+    the same mesh.
     """
     if len(mesh.faces) == 0:
         raise UserError("an empty mesh cannot be exported", "the reconstruction has no surface", f"look at its stages before: {path}")
@@ -150,6 +154,9 @@ def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=N
     doc = _Document(name)
     if root_transform is not None and not np.allclose(root_transform, np.eye(4), atol=1e-12):
         doc.json["nodes"][0]["matrix"] = np.asarray(root_transform, np.float64).T.ravel().tolist()
+    if instances:
+        nodes = [{"mesh": 0, "name": n, "matrix": np.asarray(m, np.float64).T.ravel().tolist()} for n, m in instances]
+        doc.json["nodes"], doc.json["scenes"] = nodes, [{"nodes": list(range(len(nodes)))}]
     normals = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     if (length < 1e-6).any():

@@ -261,11 +261,13 @@ def _parts(file: _File, primitive: dict, asset_from_node: np.ndarray, materials:
     return Part(v @ linear.T + asset_from_node[:3, 3], faces, normals, uv, key, material)
 
 
-def read_gltf(path: Path) -> tuple[Mesh, Material]:
-    """Mesh in the coordinates after the node transforms, and its material. Vertex colours, occlusion and emission are ignored."""
+def read_gltf(path: Path, nodes: tuple[str, ...] = ()) -> tuple[Mesh, Material]:
+    """Mesh in the coordinates after the node transforms, and its material. Vertex colours, occlusion and emission are ignored.
+
+    nodes: names of the nodes whose meshes are taken; all where empty."""
     file = _File(path)
     doc = file.json
-    parts, materials = [], {}
+    parts, materials, names = [], {}, set()
     try:
         scene = doc["scenes"][doc.get("scene", 0)] if doc.get("scenes") else {"nodes": list(range(len(doc["nodes"])))}
         stack = [(n, np.eye(4), 0) for n in reversed(scene.get("nodes", []))]
@@ -275,9 +277,16 @@ def read_gltf(path: Path) -> tuple[Mesh, Material]:
                 raise UserError("the model's nodes form a loop", fix=f"export it again: {path}")
             node = doc["nodes"][index]
             asset_from_node = asset_from_parent @ _local(node)
-            for primitive in doc["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
+            names |= {str(node.get("name"))} if "mesh" in node else set()
+            taken = "mesh" in node and (not nodes or node.get("name") in nodes)
+            for primitive in doc["meshes"][node["mesh"]]["primitives"] if taken else []:
                 parts.append(_parts(file, primitive, asset_from_node, materials))
             stack += [(c, asset_from_node, depth + 1) for c in reversed(node.get("children", []))]
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError, MemoryError) as e:
         raise UserError("the glTF file is damaged", f"{type(e).__name__}: {e}", f"export it again: {path}") from None
+    missing = [n for n in nodes if n not in names]
+    if missing:
+        raise UserError(
+            f"the model has no node '{missing[0]}' with a mesh", f"it has: {', '.join(sorted(names))}", f"choose of these: {path}"
+        )
     return merge_parts([p for p in parts if p is not None and len(p.faces)], path)

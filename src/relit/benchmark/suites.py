@@ -143,4 +143,36 @@ COLLECTION = Suite(
     ablations={name: (f"without={name}",) for name in ("multiplex", "search", "posterior", "coarse_to_fine", "quadrants", "light_prior")},
 )
 
-SUITES: dict[str, Suite] = {"multiview": MULTIVIEW, "flash": FLASH, "collection": COLLECTION}
+SPOT_MATERIAL = {"roughness": 0.4, "metallic": 0.0}
+DUPLICATES = Suite(
+    kind="duplicates",
+    items=(
+        Item("spot-10", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 10, **SPOT_MATERIAL}),
+        Item("bottle-10", "assets/WaterBottle.glb", "envmaps/kiara_1_dawn_1k.hdr", {"count": 10}),  # part metal
+        Item("cup-10", TEA, "envmaps/immenstadter_horn_1k.hdr", {"count": 10, "nodes": ["tea_set_01_cup_small_01"]}),
+        Item("spot-6", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 6, **SPOT_MATERIAL}),
+        Item("spot-20", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 20, **SPOT_MATERIAL}),
+        Item("spot-30", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 30, **SPOT_MATERIAL}),
+        Item("spot-60", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 60, **SPOT_MATERIAL}),
+    ),
+    relights=("envmaps/adams_place_bridge_1k.hdr", "envmaps/forest_slope_1k.hdr"),
+    options={"test_views": 8, "resolution": 1600, "test_resolution": 400, "spp": 64, "test_spp": 64, "seed": 0},
+    synthesize="relit.capture.synthetic_duplicates.synthesize_duplicates",
+    evaluate="relit.evaluate.duplicates.evaluate_duplicates",
+    bars={
+        "seconds": ("<=", 600.0),
+        "peak_memory": ("<=", 4.0),
+        "rotation_median": ("<=", 0.3),
+        "registered": (">=", 95.0),
+        "albedo_psnr": (">=", 20.0),
+        "relit_psnr": (">=", 23.5),
+        "roughness_mse": ("<=", 0.06),
+        "environment_mse": ("<=", 0.05),
+        "chamfer": ("<=", 0.03),
+    },
+    ablations={
+        name: (f"without={name}",) for name in ("rotation_sweep", "matching", "search", "refinement", "visibility", "metal", "ground")
+    },
+)
+
+SUITES: dict[str, Suite] = {"multiview": MULTIVIEW, "flash": FLASH, "collection": COLLECTION, "duplicates": DUPLICATES}

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from relit.cameras.pinhole import lens_of
-from relit.capture import colmap_model, idr, llff, middlebury, photo, transforms_json
+from relit.capture import colmap_model, idr, iron, llff, middlebury, photo, samurai, sfd, transforms_json
 from relit.capture.corrections import Corrected, corrected_masks, corrected_sphere, with_corrected_masks
 from relit.capture.frames import Frame, Reading
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
@@ -24,9 +24,11 @@ from relit.scene import Capture, Photo, Sphere
 
 READERS = {  # in this order; the first that recognises the folder reads it
     "transforms": transforms_json,
+    "iron": iron,
     "idr": idr,
     "middlebury": middlebury,
     "colmap": colmap_model,
+    "samurai": samurai,
     "llff": llff,
     "photos": photo,
 }
@@ -36,13 +38,19 @@ LOOKED_AT = 12  # photos that are looked at for a plain backdrop
 
 
 def open_capture(
-    path: str | Path, *, sphere: Sphere | None = None, masks: str = "auto", max_side: int | None = None, min_photos: int = 3
+    path: str | Path,
+    *,
+    sphere: Sphere | None = None,
+    masks: str = "auto",
+    max_side: int | None = None,
+    min_photos: int = 3,
+    focal: float | None = None,
 ) -> Capture:
     """Read a capture of any known format; photos decode later, when `Photo.load` is called.
 
     sphere: the object sphere in the units of the cameras; found when not given. masks: 'auto' takes alpha channels, else mask files, else
     a plain backdrop, else none; 'none', 'alpha', 'files', 'threshold', 'grabcut', 'segment' ask for one kind.
-    max_side: photos are resized to at most so many pixels. min_photos: fewer photos are an error.
+    max_side: photos are resized to at most so many pixels. min_photos: fewer photos are an error. focal: pixels, of a photo of duplicates.
     Raises UserError (exit code 3) for everything that is wrong with the input.
     """
     path = Path(path).expanduser()
@@ -50,6 +58,9 @@ def open_capture(
         raise UserError(f"unknown kind of masks '{masks}'.{did_you_mean(masks, MASKS)}", fix=f"choose one of {', '.join(MASKS)}", code=2)
     if not path.exists():
         raise UserError("the input is not there", fix=f"check the path: {path}")
+    duplicates = sfd.recognise(path)
+    if duplicates is not None:
+        return sfd.open_duplicates(duplicates, focal=focal, max_side=max_side)
     reading = _read(path)
     headers = photo.headers_of(reading.frames)
     notes = list(reading.notes) + _size_notes(reading, headers)

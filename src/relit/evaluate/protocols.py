@@ -87,7 +87,13 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     Call `relit.device.use_device` first.
     """
     from relit.asset.asset import load_asset
+    from relit.evaluate.duplicates import evaluate_duplicates, is_duplicates_truth
+    from relit.evaluate.flash import evaluate_flash, is_flash_truth
 
+    if is_duplicates_truth(truth_folder):
+        return evaluate_duplicates(run_or_asset, truth_folder, spp=min(spp, 64), seed=seed)
+    if is_flash_truth(truth_folder):
+        return evaluate_flash(run_or_asset, truth_folder, spp=spp, seed=seed)
     asset = load_asset(run_or_asset)
     if has_truth(truth_folder):
         result = evaluate_asset(asset, load_truth(truth_folder), spp=spp, seed=seed)

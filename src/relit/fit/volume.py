@@ -6,6 +6,7 @@ Levels double the grid; between levels the field is made a distance again and th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_loss, mask_loss, normal_loss
-from relit.fit.pixels import PixelBank, batch_of, camera_rows, draw_pixels, rays_through
+from relit.fit.pixels import PixelBank, RayBatch, batch_of, camera_rows, draw_pixels, rays_through
 from relit.geometry.sdf import (
     SdfGrid,
     dense_values,
@@ -28,7 +29,7 @@ from relit.geometry.sdf import (
     write_rows,
 )
 from relit.rendering.background import Background, render_background
-from relit.rendering.march import march, sphere_interval
+from relit.rendering.march import Marched, march, sphere_interval
 from relit.rendering.shade import CHANNELS, shade, start_features, start_reflections
 from relit.scene import Camera
 
@@ -62,13 +63,23 @@ class VolumeOptions:
 
 @dataclass
 class VolumeModel:
-    """What the pass optimises. grid: SDF and features. reflections: the learnt reflection map. background: or None."""
+    """What the pass optimises. grid: SDF and features. reflections: the learnt reflection map. background: or None.
+
+    appearance: another deferred appearance than rendering/shade.py's, called as f(marched, rays, cameras, reflections) -> (radiance
+    Color3f premultiplied with opacity, unit normal Vector3f); `reflections` is then whatever flat Float it learns, each entry
+    with its own rate, `rates` (Float, times 0.06)."""
 
     grid: SdfGrid
     reflections: Any
     background: Background | None
     inv_s: float = 0.0
     extra: dict[str, Any] = field(default_factory=dict)
+    appearance: Callable | None = None
+    rates: Any = 1.0
+
+    def shade(self, m: Marched, rays: RayBatch, cameras):
+        """Radiance premultiplied with opacity, and unit normal. cameras: as `PixelBank.cameras`."""
+        return shade(m, rays.d, self.reflections) if self.appearance is None else self.appearance(m, rays, cameras, self.reflections)
 
 
 def start_model(values: np.ndarray, level: np.ndarray, background: Background | None, full: bool) -> VolumeModel:
@@ -105,13 +116,13 @@ def fit_volume(bank: PixelBank, model: VolumeModel, options: VolumeOptions, stag
     done = 0
     saved = stage.load("checkpoint")
     start = int(saved["step"]) if saved else 0
-    camera_adam = Adam(6 * bank.views)
+    camera_adam = Adam(dr.width(bank.corrections))
     for number, (n, steps) in enumerate(zip(options.levels, options.steps, strict=False)):
         if start >= done + steps and number + 1 < len(options.levels):
             done += steps
             continue
         if saved and start > done:
-            _restore(model, bank, saved)
+            restore_model(model, bank, saved)
         elif model.grid.n != n:
             next_level(model, n, options.band)
         if start >= done + steps:
@@ -159,7 +170,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
             t0 = t0 + jitter * dt
         dr.eval(batch.o, batch.d, batch.rgb, batch.mask, t0, t1)
         m = march(grid, batch.o, batch.d, t0, t1, inv_s, dt)
-        colour, normal = shade(m, batch.d, model.reflections)
+        colour, normal = model.shade(m, batch, bank.cameras)
         if model.background is not None:
             colour = colour + m.transmittance * render_background(model.background, batch.o, batch.d, jitter)
         # with masks, only whole object pixels: silhouettes are the mask term's, which has no preference for dark or bright
@@ -181,11 +192,12 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         moved = adam["sdf"].step(dr.detach(grid.row_values), gradients[0], options.sdf_rate * h * decay)
         grid.row_values = moved - kappa * neighbour_mean_difference(grid, diffusion)
         grid.features = adam["features"].step(dr.detach(grid.features), gradients[1], options.feature_rate * decay)
-        model.reflections = adam["reflections"].step(dr.detach(model.reflections), gradients[2], 0.06 * decay)
+        model.reflections = adam["reflections"].step(dr.detach(model.reflections), gradients[2], 0.06 * decay, model.rates)
         if model.background is not None:
             model.background.cells = adam["background"].step(dr.detach(model.background.cells), gradients[3], 0.05 * decay)
         if refine:
-            bank.corrections = camera_adam.step(dr.detach(bank.corrections), gradients[-1], options.refine_cameras * decay)
+            ratio = model.extra.get("correction_rates", 1.0)  # Float as wide as the corrections
+            bank.corrections = camera_adam.step(dr.detach(bank.corrections), gradients[-1], options.refine_cameras * decay, ratio)
         dr.eval(grid.row_values)
         write_rows(grid)
         return report
@@ -200,11 +212,12 @@ def render_views(model: VolumeModel, cameras: list[Camera], step: float = 0.9) -
     for view, camera in enumerate(cameras):
         index = dr.arange(mi.UInt32, camera.width * camera.height)
         x, y = mi.Float(index % camera.width) + 0.5, mi.Float(index // camera.width) + 0.5
-        o, d = rays_through(rows, dr.opaque(mi.UInt32, view, camera.width * camera.height), x, y)
+        number = dr.opaque(mi.UInt32, view, camera.width * camera.height)
+        o, d = rays_through(rows, number, x, y)
         t0, t1 = sphere_interval(o, d)
         dr.eval(o, d, t0, t1)
         m = march(model.grid, o, d, t0, t1, inv_s, dt)
-        colour, _ = shade(m, d, model.reflections)
+        colour, _ = model.shade(m, RayBatch(o, d, None, None, number, index), rows)
         colour = dr.select(t1 > t0, colour, 0)
         if model.background is not None:
             half = dr.full(mi.Float, 0.5, dr.width(index))
@@ -228,7 +241,8 @@ def _state(model: VolumeModel, bank: PixelBank) -> dict[str, np.ndarray]:
     return out
 
 
-def _restore(model: VolumeModel, bank: PixelBank, saved: dict[str, np.ndarray]) -> None:
+def restore_model(model: VolumeModel, bank: PixelBank, saved: dict[str, np.ndarray]) -> None:
+    """Put a checkpoint's arrays into the model and the bank."""
     values, n = saved["values"], saved["values"].shape[0]
     features = np.zeros((n**3, CHANNELS), np.float32)
     features[saved["nodes"]] = saved["features"][1:]

@@ -40,11 +40,8 @@ def shade(m: Marched, d, reflections):
     return dr.maximum(mi.Color3f(F[0], F[1], F[2]) + dr.maximum(F[3], 0) * e, 0), n
 
 
-def mean_radiance(grid, features: np.ndarray, reflections, points: np.ndarray) -> np.ndarray:
-    """(N, 3) radiance at surface points (N, 3), averaged over directions: what the features say, with the mean of the reflection map.
-
-    features: (rows, CHANNELS).
-    """
+def features_at(grid, features: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, CHANNELS) trilinear features at points (N, 3) near the surface. features: (rows, CHANNELS)."""
     n = grid.n
     at = (points.astype(np.float64) + 1) * (0.5 * (n - 1))
     low = np.clip(np.floor(at).astype(np.int64), 0, n - 2)
@@ -58,6 +55,14 @@ def mean_radiance(grid, features: np.ndarray, reflections, points: np.ndarray) -
         w = np.where(row > 0, w, 0)  # nodes outside the band know nothing
         values += w[:, None] * features[row]
         weight += w
-    values /= np.maximum(weight, 1e-6)[:, None]
+    return values / np.maximum(weight, 1e-6)[:, None]
+
+
+def mean_radiance(grid, features: np.ndarray, reflections, points: np.ndarray) -> np.ndarray:
+    """(N, 3) radiance at surface points (N, 3), averaged over directions: what the features say, with the mean of the reflection map.
+
+    features: (rows, CHANNELS).
+    """
+    values = features_at(grid, features, points)
     mirror = np.exp(np.array(reflections).reshape(ROWS, COLUMNS, 3)).mean((0, 1))
     return np.maximum(values[:, :3] + np.maximum(values[:, 3:4], 0) * mirror, 1e-3).astype(np.float32)

@@ -84,7 +84,14 @@ def flash_flags(parser: Parser) -> None:
     more = parser.more.add_argument
     sampling_flags(parser, views=120, test_views=20, resolution=400, spp=64, test_spp=256)
     more("--node", nargs="*", default=[], metavar="NAME", help="only these nodes of a .glb (default: all)")
-    more("--flash-offset", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"), help="of the flash, right, down, forward (default -.11 -.06 0)")
+    more(
+        "--flash-offset",
+        type=float,
+        nargs=3,
+        default=None,
+        metavar=("X", "Y", "Z"),
+        help="of the flash, right, down, forward (default -.11 -.06 0)",
+    )
     more("--png", action="store_true", help="photos as 8-bit PNG instead of linear EXR")
 
 
@@ -160,7 +167,9 @@ def duplicates_flags(parser: Parser) -> None:
     more("--test-resolution", type=int, default=400, help="pixels a side of the novel views (default 400)")
     more("--spp", type=int, default=64, help="samples a pixel of the photo (default 64)")
     more("--test-spp", type=int, default=64, help="samples a pixel of what is measured against (default 64)")
-    more("--lean", type=float, default=12.0, metavar="DEGREES", help="standard deviation of the tilt away from the resting pose (default 12)")
+    more(
+        "--lean", type=float, default=12.0, metavar="DEGREES", help="standard deviation of the tilt away from the resting pose (default 12)"
+    )
     more("--spread", type=float, default=1.0, help="factor on the radius of the pile (default 1)")
     more("--node", nargs="*", default=[], metavar="NAME", help="only these nodes of a .glb (default: all)")
 

@@ -1,0 +1,282 @@
+"""Photos in a dark room under the camera's own flash -> shape, rough plastic and the flash itself. The recipe of the `flash` capture.
+
+    photos     decode, carry the cameras to the unit frame
+    hull       visual hull of the masks
+    volume     signed distance field by volume rendering, shaded by the flash at each rendered point     rendering/shade_flash.py
+    mesh       zero level set, decimated; texture atlas; albedos of each vertex
+    surface    rough-plastic textures, normal map and flash by exact direct light and estimated inter-reflection   fit/flash_surface.py
+    asset      textures with filled gutters, everything back in the frame of the user's cameras
+
+PIR (Bao et al. 2024), with voxels and textures where the paper has networks. Intensity and albedos share a factor that direct light cannot
+settle: it is set so that the brightest diffuse albedo is BRIGHTEST.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from relit.conventions import move_points, similarity
+from relit.errors import UserError, did_you_mean
+from relit.fit.flash_features import FlashView, capture_features
+from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
+from relit.fit.kinship import start_kinship
+from relit.fit.multiview import load_pixels, rotation_from_y, run_arrays, score_held_out
+from relit.fit.pixels import PixelBank
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.geometry.atlas import unwrap
+from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
+from relit.geometry.hull import visual_hull
+from relit.geometry.mesh import extract_mesh
+from relit.geometry.sdf import dense_values, row_features
+from relit.materials.plastic_field import MOST_SPECULAR, plastic_pictures, start_plastic
+from relit.materials.rough_plastic import IOR, Coat
+from relit.rendering.shade import features_at
+from relit.rendering.shade_flash import FlashAppearance, alpha_on, start_learnt
+from relit.rendering.transport import TraceableMesh
+from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
+
+LIGHT = "a flash that moves with the camera, in a dark room"
+STAGES = ("volume", "mesh", "surface")
+BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
+PLACE = 0.15  # how much a unit length counts beside a display value when places are compared
+START_ALBEDO, MEAN_COSINE = 0.4, 0.7
+
+
+@dataclass(frozen=True)
+class FlashOptions:
+    """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. max_pixels: photos are
+    shrunk until all together have no more. shadows: soft visibility in the last level of the volume pass.
+    faces: of the mesh, about. texture: texels a side. surface_steps, points: steps of the surface pass, pixels per step.
+    directions: of inter-reflection per pixel and estimate. bounces: of it. ior: index of refraction of the coat.
+    smooth: weight of the material's smoothness. without: parts that are switched off, names of WITHOUT.
+    """
+
+    levels: tuple[int, ...] = (96, 192)
+    level_steps: tuple[int, ...] = (400, 500)
+    rays: int = 8192
+    max_pixels: int = 24_000_000
+    shadows: bool = True
+    faces: int = 60_000
+    texture: int = 512
+    surface_steps: int = 2000
+    points: int = 8192
+    directions: int = 1
+    bounces: int = 2
+    ior: float = IOR
+    smooth: float = 0.0003
+    without: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if self.directions < 0 or self.bounces < 1:
+            raise ValueError("directions must be at least 0 and bounces at least 1")
+        for name in self.without:
+            if name not in WITHOUT:
+                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+
+
+WITHOUT = ("offset", "shadow", "interreflection", "features", "refinement")
+
+PRESETS = {
+    "draft": {
+        "levels": (48, 96),
+        "level_steps": (150, 200),
+        "rays": 4096,
+        "max_pixels": 8_000_000,
+        "faces": 20_000,
+        "texture": 256,
+        "surface_steps": 400,
+        "points": 4096,
+        "bounces": 1,
+    },
+    "standard": {},
+    "high": {"levels": (128, 256), "level_steps": (800, 1000), "max_pixels": 60_000_000, "texture": 1024, "surface_steps": 5000},
+}
+
+
+def options_for(quality: str) -> FlashOptions:
+    """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
+    if quality not in PRESETS:
+        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
+    return FlashOptions(**PRESETS[quality])
+
+
+def surface_options(o: FlashOptions, saturated: float) -> FlashSurfaceOptions:
+    off = {}
+    if "offset" in o.without:
+        off["offset_rate"] = 0.0
+    if "refinement" in o.without:
+        off["slope_rate"] = 0.0
+    directions = 0 if "interreflection" in o.without else o.directions
+    share = {"smooth": o.smooth} if "features" not in o.without else {"smooth": 0.0}
+    shadow = "shadow" not in o.without
+    return FlashSurfaceOptions(o.surface_steps, o.points, directions, o.bounces, shadow, saturated=saturated, **off, **share)
+
+
+def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> Asset:
+    """Run all stages of the recipe in the run folder; stages that are done are read back. `capture` has cameras and an object sphere."""
+    if not capture.has_cameras or capture.sphere is None:
+        raise ValueError("reconstruct needs cameras and the object sphere")
+    if len(options.levels) != len(options.level_steps):
+        raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
+    world_from_unit = capture.sphere.world_from_unit
+    bank, cameras, masks, level = load_pixels(capture, options, run)
+    check_photos(bank, cameras, masks, level)
+    coat = Coat(options.ior)
+    if run.done("mesh"):
+        parts = run_arrays(run, "mesh", "mesh")
+    else:
+        model = volume_stage(bank, cameras, masks, level, coat, run, options, seed)
+        score_held_out(capture, model, run, np.eye(4))
+        parts = mesh_stage(model, run, options)
+    mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
+    if run.done("surface"):
+        maps = run_arrays(run, "surface", "maps")
+    else:
+        maps = surface_stage(bank, cameras, mesh, parts, coat, saturation(capture), run, options, seed)
+    return assemble(capture, mesh, maps, world_from_unit, options.ior)
+
+
+def saturation(capture: Capture) -> float:
+    """The linear value from which on a pixel may be over-exposed: photos in EXR or HDR are not clipped."""
+    return np.inf if all(p.name.lower().endswith((".exr", ".hdr")) for p in capture.photos) else 0.99
+
+
+def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarray) -> None:
+    """Raises UserError for photos that are no flash capture that could be reconstructed. level: mean radiance of the object (3,)."""
+    if masks is None:
+        raise UserError(
+            "the surroundings are not dark, and there are no masks",
+            "a flash capture is taken in a dark room, where the flash is the only light and the background stays black",
+            "take --capture multiview for photos under fixed lamps; or give masks for flash photos with a visible background",
+        )
+    centres = np.array([c.centre for c in cameras])
+    reach = np.linalg.norm(centres, axis=1).mean()
+    if np.linalg.norm(centres - centres.mean(0), axis=1).max() < 0.05 * reach:
+        raise UserError(
+            "all photos are taken from one place",
+            "shape is found by comparing photos from different sides, and a flash lights each of them differently",
+            "photograph from all around the object",
+        )
+    rgbm = np.array(bank.rgbm).reshape(-1, 4)
+    inside = rgbm[rgbm[:, 3] > 0.99][::7, :3]
+    if float(np.max(level)) < 0.004:
+        raise UserError(
+            "the photos are black", "the flash did not fire, or the exposure was far too short", "look at the photos, and take them again"
+        )
+    burnt = float((inside.min(1) >= 0.99).mean()) if len(inside) else 0.0
+    if burnt > 0.5:
+        raise UserError(
+            f"{100 * burnt:.0f} % of the object's pixels are over-exposed",
+            "what is white in every photo has no colour, and its highlights have no edge",
+            "take the photos again with a shorter exposure, or with the flash farther away",
+        )
+
+
+def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coat, run, options: FlashOptions, seed: int) -> VolumeModel:
+    """Visual hull, then the volume pass with the flash's shading. The model's `extra` holds the intensity."""
+    distance2 = float(np.median([c.centre @ c.centre for c in cameras]))
+    intensity = np.pi * distance2 * float(level.mean()) / (START_ALBEDO * MEAN_COSINE)
+    shadows = options.shadows and "shadow" not in options.without
+    appearance = FlashAppearance(coat, intensity, options.levels[-1] if shadows else np.inf)
+    with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
+        try:
+            values = visual_hull(cameras, masks, options.levels[0])
+        except ValueError:
+            raise UserError(
+                "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
+                "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
+                "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS",
+                code=4,
+            ) from None
+        model = start_model(values, START_ALBEDO * level / level.mean(), None, full=False)
+        model.reflections, model.rates = start_learnt()
+        if "offset" in options.without:
+            rates = np.array(model.rates)
+            rates[:3] = 0
+            model.rates = mi.Float(rates)
+        model.appearance, appearance.model = appearance, model
+        model.extra["intensity"] = intensity
+        fit_volume(bank, model, VolumeOptions(options.levels, options.level_steps, options.rays), stage, seed)
+        offset = np.array(model.reflections)[:3]
+        run.say(f"flash after the volume pass: offset {offset.round(4).tolist()} of the object sphere's radius")
+    return model
+
+
+def mesh_stage(model: VolumeModel, run, options: FlashOptions) -> dict[str, np.ndarray]:
+    """Mesh, atlas, and what the volume pass knows of each vertex. Returns (and keeps) vertices, faces, normals, uvs, albedo (V, 4:
+    diffuse and specular), alpha (V,), offset (3,), intensity."""
+    with run.stage("mesh", title="mesh and atlas") as stage:
+        mesh, how = unwrap(extract_mesh(dense_values(model.grid), faces=options.faces), options.texture)
+        if how != "xatlas":
+            run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
+        learnt = np.array(model.reflections)
+        parts = {
+            "vertices": mesh.vertices,
+            "faces": mesh.faces,
+            "normals": mesh.normals,
+            "uvs": mesh.uvs,
+            "albedo": np.maximum(features_at(model.grid, row_features(model.grid), mesh.vertices), 0).astype(np.float32),
+            "alpha": alpha_on(learnt, mesh.vertices),
+            "offset": learnt[:3],
+            "intensity": np.array(model.extra["intensity"]),
+        }
+        stage.save("mesh", **parts)
+    return parts
+
+
+def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, saturated: float, run, options: FlashOptions, seed: int):
+    """Material and flash. Returns (and keeps) diffuse, specular, alpha, normal, offset and intensity (unit frame)."""
+    o = surface_options(options, saturated)
+    with run.stage("surface", steps=o.steps, title="material and flash (surface pass)") as stage:
+        face, bary = rasterise_atlas(mesh, options.texture)
+        known = face >= 0
+        spread = lambda v: fill_gutters(interpolate(v, mesh.faces, face, bary), known)  # noqa: E731
+        traceable = TraceableMesh(mesh, np.zeros_like(mesh.vertices))
+        flash = FlashView(parts["offset"], float(parts["intensity"]))
+        texels = {
+            "x": interpolate(mesh.vertices, mesh.faces, face, bary)[known],
+            "n": interpolate(mesh.normals, mesh.faces, face, bary)[known],
+        }
+        found = capture_features(bank, cameras, traceable, texels["x"], texels["n"], coat, flash)
+        diffuse = spread(parts["albedo"][:, :3])
+        diffuse[known] = np.where(found.seen[:, None], found.albedo, diffuse[known])
+        scale = BRIGHTEST / max(float(np.percentile(diffuse[known].max(1), 99)), 1e-6)
+        specular = np.clip(spread(parts["albedo"][:, 3:])[..., 0] * scale, 0.05, MOST_SPECULAR)
+        field = start_plastic(np.clip(fill_gutters(diffuse, known) * scale, 0, 1), specular, spread(parts["alpha"][:, None])[..., 0])
+        features = np.zeros((*known.shape, 4), np.float32)
+        features[known] = found.features
+        log_intensity = mi.Float([float(np.log(flash.intensity / scale))])
+        features = fill_gutters(features, known)
+        kinship = None
+        if "features" not in options.without:
+            place = PLACE * spread(mesh.vertices)
+            lobe = np.stack([specular, spread(parts["alpha"][:, None])[..., 0]], -1)
+            kinship = start_kinship(np.concatenate([features[..., :3], place], -1), known, lobe)
+        model = FlashModel(field, mi.Float(features.ravel()), kinship, mi.Float(parts["offset"]), log_intensity, coat)
+        fit_flash_surface(bank, cameras, traceable, model, o, stage, seed)
+        maps = {name: fill_gutters(picture, known) for name, picture in plastic_pictures(model.field).items()}
+        maps |= {"offset": np.array(model.offset), "intensity": np.exp(np.array(model.log_intensity))}
+        stage.save("maps", **maps)
+        run.say(f"flash: offset {maps['offset'].round(4).tolist()} of the object sphere's radius")
+    return maps
+
+
+def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_from_unit: np.ndarray, ior: float) -> Asset:
+    """The asset: +Y up where the capture knows its up direction; lengths in the units of the user's cameras."""
+    up = np.array([0.0, 1.0, 0.0]) if capture.up is None else np.asarray(capture.up, np.float64)
+    world_from_asset = similarity(rotation_from_y(up), capture.sphere.centre)
+    asset_from_unit = np.linalg.inv(world_from_asset) @ world_from_unit
+    radius = float(np.cbrt(np.linalg.det(asset_from_unit[:3, :3])))
+    placed = replace(
+        mesh,
+        vertices=move_points(asset_from_unit, mesh.vertices).astype(np.float32),
+        normals=(mesh.normals @ (asset_from_unit[:3, :3] / radius).T).astype(np.float32),
+    )
+    roughness = np.sqrt(maps["alpha"])
+    material = Material(maps["diffuse"], roughness, np.zeros((1, 1), np.float32), ior, maps["specular"], maps["normal"])
+    flash = Flash(maps["offset"].astype(np.float64) * radius, np.full(3, float(maps["intensity"][0]) * radius**2))
+    cameras = tuple((p.name, p.camera) for p in capture.photos)
+    return Asset(placed, material, world_from_asset, None, cameras, {"material": "rough_plastic"}, flash)

@@ -1,0 +1,94 @@
+"""What a flash capture tells of each place of the surface before any fit of the material (PIR Sec. 3.5, without a network's features).
+
+Divided by the diffuse shading of the flash, every photo gives a shading-free colour of the place: too bright where a highlight or an
+inter-reflection lies, right elsewhere. Low in the distribution over photos is the diffuse albedo. Places of like colour are
+likely of one material; the features hold the colour as it is displayed, and how bright the place gets at most above it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.conventions import srgb_from_linear
+from relit.fit.pixels import PixelBank
+from relit.lighting.flash import incident, light_position
+from relit.materials.rough_plastic import Coat
+from relit.rendering.transport import OFFSET, TraceableMesh
+from relit.scene import Camera
+
+LOW = 0.15  # quantile over photos that is taken for the diffuse part
+LEAST_COSINE = 0.25
+ALPHA = 0.2  # of the coat that the diffuse light passes
+
+
+@dataclass(frozen=True)
+class FlashView:
+    """offset: (3,) unit frame, OpenCV camera axes. intensity: radiant."""
+
+    offset: np.ndarray
+    intensity: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """albedo: (N, 3) diffuse, for the given intensity. seen: (N,) bool, enough photos. features: (N, 4) float32."""
+
+    albedo: np.ndarray
+    seen: np.ndarray
+    features: np.ndarray
+
+
+def capture_features(
+    bank: PixelBank, cameras: list[Camera], mesh: TraceableMesh, x: np.ndarray, n: np.ndarray, coat: Coat, flash: FlashView
+) -> Found:
+    """The features of N surface points x with normals n, both (N, 3), unit frame."""
+    values = np.full((bank.views, len(x), 3), np.nan, np.float16)
+    n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
+    point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
+    dr.eval(point, normal)
+    with dr.suspend_grad():
+        for view, camera in enumerate(cameras):
+            values[view] = shading_free(bank, camera, view, mesh, point, normal, coat, flash)
+    seen = np.isfinite(values[..., 0]).sum(0) >= 3
+    albedo = np.full((len(x), 3), 0.5, np.float32)
+    for part in np.array_split(np.flatnonzero(seen), max(1, len(x) // 20_000)):
+        albedo[part] = np.nanquantile(values[:, part].astype(np.float32), LOW, axis=0)
+    shown = srgb_from_linear(np.clip(albedo, 0, 1.5))
+    return Found(albedo, seen, np.concatenate([shown, np.zeros((len(x), 1))], 1).astype(np.float32))
+
+
+def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, coat: Coat, flash: FlashView) -> np.ndarray:
+    """(N, 3): the photo's value at the points over what a white diffuse base would show there; NaN where the photo does not show them."""
+    number = dr.opaque(mi.UInt32, view)
+    eye = light_position(bank.cameras, number, mi.Vector3f(0))
+    light = light_position(bank.cameras, number, mi.Vector3f(*[float(v) for v in flash.offset]))
+    v, _ = incident(eye, x)
+    l, inverse = incident(light, x)
+    cos_v, cos_l = dr.dot(n, v), dr.dot(n, l)
+    ok = (cos_v > LEAST_COSINE) & (cos_l > LEAST_COSINE)
+    k = [dr.gather(mi.Vector4f, bank.cameras, number * 4 + j) for j in range(4)]
+    d = x - eye
+    r = [mi.Vector3f(k[1][c], k[2][c], k[3][c]) for c in range(3)]  # columns of world_from_camera
+    z = dr.dot(r[2], d)
+    column = dr.floor(k[0].x * dr.dot(r[0], d) / z + k[0].z)
+    row = dr.floor(k[0].y * dr.dot(r[1], d) / z + k[0].w)
+    ok &= (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    pixel = mi.UInt32(dr.clip(row, 0, camera.height - 1)) * camera.width + mi.UInt32(dr.clip(column, 0, camera.width - 1))
+    p = dr.gather(mi.Vector4f, bank.rgbm, pixel + dr.gather(mi.UInt32, bank.offsets, number), ok)
+    ok &= p.w > 0.99
+    start = mi.Point3f(x + n * (2 * OFFSET))
+    for end in (eye, light):
+        to = end - mi.Vector3f(start)
+        length = dr.norm(to)
+        ok &= ~mesh.scene.ray_test(mi.Ray3f(start, to / length, length, 0.0, []), coherent=False, active=ok)
+    alpha = mi.Float(ALPHA)
+    base = (
+        coat.transmittance(cos_v, alpha) * coat.transmittance(cos_l, alpha) / (1 - coat.internal(alpha)) * cos_l * (dr.inv_pi / coat.ior**2)
+    )
+    out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * inverse * flash.intensity, 1e-6)
+    out = dr.select(ok, out, dr.nan)
+    return np.array(out).T

@@ -1,0 +1,141 @@
+"""Which places of a surface are alike, and how they share what highlights tell of them (PIR Sec. 3.5, without a network).
+
+A highlight tells of few texels at a time, and only where the flash happens to be mirrored. Texels belong, by the similarity of their
+features, to a few groups with one specular albedo and one alpha each; a texel has its own deviation from that besides, which fades where
+nothing supports it. The groups gather the evidence of all their texels: what is seen here holds for like places everywhere.
+
+A broad strong lobe over a dark base looks much like a narrow weak one over a brighter base but for its very peak, and steps along gradients
+stop in between, the diffuse albedo of every texel having settled on what the wrong lobe leaves over. So the groups' numbers are searched
+for: for each width of the lobe on a ladder, the specular albedo and a factor and a grey shift of the diffuse albedo are a linear
+least-squares problem; the width with the least error is taken, and the diffuse albedos move with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.materials.plastic_field import PlasticField
+from relit.materials.rough_plastic import Plastic
+
+NEAREST = 4  # groups of a texel
+LADDER = np.geomspace(0.04, 0.75, 18)  # widths alpha that are tried
+COLUMNS = 4  # lobe of a specular albedo of 1, diffuse light as it is, diffuse light of an albedo of 1, photo
+FORGET = 0.8  # of the running sums per call
+PRIOR = (1e-3, 1e-2, 3e-3)  # belief in no change of specular albedo, factor and shift, against the evidence of the mean group
+
+
+@dataclass
+class Kinship:
+    """groups: their number. index: UInt32 [texels * NEAREST]. weight: Float [texels * NEAREST], summing to 1 for each texel. level: Float
+    [groups * 2], specular albedo and alpha of each group. sums: (LADDER, groups, COLUMNS, COLUMNS), running weighted sums
+    of products of `share_evidence`'s columns."""
+
+    groups: int
+    index: Any
+    weight: Any
+    level: Any
+    sums: np.ndarray
+
+    def spread(self, values, channels: int = 2):
+        """Float [groups * channels] -> Float [texels * channels]."""
+        k = dr.arange(mi.UInt32, dr.width(self.weight) // NEAREST * channels)
+        texel, channel = k // channels, k % channels
+        out = mi.Float(0)
+        for j in range(NEAREST):
+            at = texel * NEAREST + j
+            group = dr.gather(mi.UInt32, self.index, at)
+            out = dr.fma(dr.gather(mi.Float, self.weight, at), dr.gather(mi.Float, values, group * channels + channel), out)
+        return out
+
+
+def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, groups: int = 40, width: float = 0.08) -> Kinship:
+    """Groups by k-means. features: (S, S, C), distances of about `width` are alike. known: (S, S) bool. lobe: (S, S, 2) start of
+    specular albedo and alpha."""
+    from scipy.cluster.vq import kmeans2
+    from scipy.spatial import cKDTree
+
+    flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
+    rng = np.random.default_rng(5)
+    some = flat[known.ravel()]
+    some = some[rng.integers(0, len(some), 20_000)] + rng.normal(0, 1e-4, (20_000, flat.shape[1]))
+    centres, _ = kmeans2(some, groups, iter=20, minit="++", rng=rng)
+    distance, index = cKDTree(centres).query(flat, NEAREST)
+    weight = np.exp((distance[:, :1] ** 2 - distance**2) / (2 * width**2))
+    weight /= weight.sum(1, keepdims=True)
+    level = np.tile(np.median(lobe[known], axis=0), (groups, 1))
+    numbers = lambda a: mi.Float(np.ascontiguousarray(a, np.float32).ravel())  # noqa: E731
+    return Kinship(
+        groups,
+        mi.UInt32(index.astype(np.uint32).ravel()),
+        numbers(weight),
+        numbers(level),
+        np.zeros((len(LADDER), groups, COLUMNS, COLUMNS)),
+    )
+
+
+def share_evidence(kin: Kinship, field: PlasticField, uv, plastic: Plastic, shade: Callable, photo, weight, rate: float) -> None:
+    """Move all groups by `rate` of the way to their best numbers, in the levels and in the textures.
+
+    plastic: at the points. shade: Plastic -> radiance (Color3f) at the points, linear in the albedos. photo: Color3f, what direct light
+    should show. weight: Color3f of squared differences.
+    """
+    s = field.size
+    texel = mi.UInt32(dr.clip(uv.y * s, 0, s - 1)) * s + mi.UInt32(dr.clip(uv.x * s, 0, s - 1))
+    group = dr.gather(mi.UInt32, kin.index, texel * NEAREST)  # the nearest
+    one = mi.Float(1)
+    now = np.zeros_like(kin.sums)
+    for k, alpha in enumerate(LADDER):
+        width = dr.opaque(mi.Float, float(alpha))
+        columns = [shade(Plastic(mi.Color3f(0), one, width)), shade(Plastic(plastic.diffuse, mi.Float(0), width))]
+        columns += [shade(Plastic(mi.Color3f(1), mi.Float(0), width)), photo]
+        totals = {}
+        for i in range(COLUMNS):
+            for j in range(i, COLUMNS):
+                value = dr.sum(columns[i] * columns[j] * weight)
+                totals[i, j] = dr.zeros(mi.Float, kin.groups)
+                dr.scatter_reduce(dr.ReduceOp.Add, totals[i, j], dr.select(dr.isfinite(value), value, 0), group)
+        dr.eval(totals)
+        for (i, j), total in totals.items():
+            now[k, :, i, j] = now[k, :, j, i] = np.array(total)
+    keep = FORGET if kin.sums.any() else 0.0
+    kin.sums = keep * kin.sums + (1 - keep) * now
+    level = np.array(kin.level).reshape(-1, 2)
+    best = best_lobes(kin.sums, level)
+    change = mi.Float((rate * (best[:, :2] - level)).astype(np.float32).ravel())
+    kin.level = kin.level + change
+    field.lobe = field.lobe + kin.spread(change)
+    both = kin.spread(mi.Float((rate * (best[:, 2:] - [1, 0])).astype(np.float32).ravel()))
+    k = dr.arange(mi.UInt32, dr.width(field.diffuse))
+    factor, shift = dr.gather(mi.Float, both, k // 4 * 2), dr.gather(mi.Float, both, k // 4 * 2 + 1)
+    field.diffuse = dr.maximum(field.diffuse * (1 + factor) + shift, 0)
+    dr.eval(kin.level, field.lobe, field.diffuse)
+
+
+def best_lobes(sums: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """From the sums the best specular albedo, alpha, factor and shift of the diffuse albedo: (groups, 4).
+
+    level: (groups, 2), what holds where a group has no evidence.
+    """
+    normal, right, photo = sums[..., :3, :3], sums[..., :3, 3], sums[..., 3, 3]
+    belief = np.array(PRIOR) * np.einsum("lgii->i", normal) / (sums.shape[0] * sums.shape[1]) + 1e-12
+    prior = np.stack([level[:, 0], np.ones(len(level)), np.zeros(len(level))], 1)  # (groups, 3)
+    normal = normal + np.diag(belief)
+    right = right + belief * prior
+    found = np.linalg.solve(normal, right[..., None])[..., 0]  # (LADDER, groups, 3)
+    found[..., 0] = np.maximum(found[..., 0], 0.01)
+    error = photo - 2 * (found * right).sum(-1) + np.einsum("lgi,lgij,lgj->lg", found, normal, found)
+    k = np.clip(error.argmin(0), 1, len(LADDER) - 2)
+    g = np.arange(len(level))
+    a, b, c = error[k - 1, g], error[k, g], error[k + 1, g]
+    t = np.clip(0.5 * (a - c) / np.maximum(a - 2 * b + c, 1e-12), -1, 1)[:, None]  # the parabola through three rungs of log alpha
+    blend = np.where(t < 0, (1 + t) * found[k, g] - t * found[k - 1, g], (1 - t) * found[k, g] + t * found[k + 1, g])
+    alpha = LADDER[k] * (LADDER[1] / LADDER[0]) ** t[:, 0]
+    known = np.einsum("lgii->g", sums[..., :3, :3]) > 0.02 * np.einsum("lgii->g", sums[..., :3, :3]).mean()
+    out = np.stack([np.clip(blend[:, 0], 0, 2), alpha, np.clip(blend[:, 1], 0.7, 1.4), np.clip(blend[:, 2], -0.1, 0.1)], 1)
+    return np.where(known[:, None], out, np.stack([*level.T, prior[:, 1], prior[:, 2]], 1))
