@@ -1,6 +1,7 @@
 # make setup | demo | test | lint | bench | viewer | validator | dist | clean
 VENV ?= .venv
 NICE ?=
+SUITES ?= multiview flash duplicates collection
 
 .PHONY: setup demo test lint bench viewer validator dist clean
 .DEFAULT_GOAL := setup
@@ -20,7 +21,7 @@ lint: setup
 	$(VENV)/bin/python -m ruff check src tests benchmarks
 
 bench: setup
-	$(NICE) $(VENV)/bin/python -m relit benchmark multiview
+	for suite in $(SUITES); do $(NICE) $(VENV)/bin/python -m relit benchmark $$suite || exit $$?; done
 
 # the Khronos glTF validator for the tests; without node they skip with a reason
 validator:
