@@ -12,6 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "src"))
 
 from relit.evaluate.definitions import DEFINITIONS  # noqa: E402
+from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS  # noqa: E402
 
 HEAD = """# What the figures mean
 
@@ -33,8 +34,20 @@ How to read them:
 """
 
 
+DUPLICATES = """
+## Photos of duplicates
+
+| figure | unit | definition |
+|---|---|---|
+"""
+
+
+def rows(definitions: dict[str, tuple[str, str]]) -> str:
+    return "".join(f"| `{name}` | {unit or '-'} | {text[0].upper()}{text[1:]} |\n" for name, (unit, text) in definitions.items())
+
+
 def page() -> str:
-    return HEAD + "".join(f"| `{name}` | {unit or '-'} | {text[0].upper()}{text[1:]} |\n" for name, (unit, text) in DEFINITIONS.items())
+    return HEAD + rows(DEFINITIONS) + DUPLICATES + rows(DUPLICATES_DEFINITIONS)
 
 
 if __name__ == "__main__":

@@ -43,6 +43,9 @@ COST = {"draft": (60.0, 1.0e9), "standard": (300.0, 2.0e9), "high": (1200.0, 3.0
 AGREES = 0.2  # an instance whose score lies further below the median did not find its place
 TOUCHES = 0.08  # unit lengths within which an instance counts as touching the ground
 GROUND_ROWS = 96
+# weight of a rotation from matching, as of a guess with a score of .82: few views and a long lens leave tilt and depth uncertain by tens
+# of degrees
+LINKED = 0.05
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class DuplicatesOptions:
     """
 
     side: int = 320
-    search_rounds: int = 4
+    search_rounds: int = 3
     levels: tuple[int, ...] = (64, 128)
     level_steps: tuple[int, ...] = (300, 400)
     rays: int = 6144
@@ -206,8 +209,8 @@ def matched(pixels, camera: Camera, run, options: DuplicatesOptions, seed: int) 
         members = sorted(cluster)
         run.say(f"matching links the instances {', '.join(str(names[k]) for k in members)}")
         together |= {(i, j) for i in members for j in members if i < j}
-        out += [(i, j, cluster[j][:3, :3] @ cluster[i][:3, :3].T, 1.0) for i in members for j in members if i < j]
-    out += [(i, j, link.rotation, 0.7) for (i, j), link in links.items() if link.rotation is not None and (i, j) not in together]
+        out += [(i, j, cluster[j][:3, :3] @ cluster[i][:3, :3].T, LINKED) for i in members for j in members if i < j]
+    out += [(i, j, link.rotation, 0.5 * LINKED) for (i, j), link in links.items() if link.rotation is not None and (i, j) not in together]
     return tuple(out)
 
 
@@ -234,7 +237,7 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
         inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
         try:
-            values = carved(views, poses, options.levels[0], 0.15)
+            values = carved(views, poses, options.levels[0], 0.15, Search.depth)
         except ValueError:
             raise UserError(
                 "the silhouettes have nothing in common",

@@ -160,9 +160,13 @@ def inflated(view: View, pose: np.ndarray, n: int, depth: float = 1.2, most: flo
     return distance_of(inside.reshape(n, n, n))
 
 
-def carved(views: list[View], poses: np.ndarray, n: int, tolerance: float) -> np.ndarray:
+def carved(views: list[View], poses: np.ndarray, n: int, tolerance: float, depth: float | None = None) -> np.ndarray:
     """Signed distance of what lies inside nearly all silhouettes: a node is out where more than `tolerance` of the views that know show
-    background there. Raises ValueError when nothing is left."""
+    background there. Raises ValueError when nothing is left.
+
+    depth: a view also counts a node as out that lies farther before or behind the object's middle than `depth` times the distance to the
+    outline, and a little: views from nearly one side would leave a body as deep as the ball.
+    """
     p = node_positions(n).reshape(-1, 3)
     told, empty = np.zeros(len(p)), np.zeros(len(p))
     for view, pose in zip(views, poses, strict=True):
@@ -172,8 +176,13 @@ def carved(views: list[View], poses: np.ndarray, n: int, tolerance: float) -> np
         ok = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height) & (q[:, 2] > 0)
         u, v = np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1)
         known = np.where(ok, view.known[v, u], 1.0) > 0.5
+        out = ~(ok & (view.mask[v, u] > 0.3))
+        if depth is not None:
+            middle = float(np.linalg.norm(camera.centre))
+            room = distance_transform_edt(np.pad((view.mask > 0.5) | (view.known < 0.5), 1))[1:-1, 1:-1] / camera.fx * middle
+            out |= np.abs(p @ (camera.centre / middle)) > depth * room[v, u] + 0.1
         told += known
-        empty += known & ~(ok & (view.mask[v, u] > 0.3))
+        empty += known & out
     inside = (told > 0) & (empty <= tolerance * told) & ((p**2).sum(1) < 0.98)
     return distance_of(inside.reshape(n, n, n))
 
@@ -246,7 +255,7 @@ class Search:
     """How poses are searched. nodes: of the coarse models, a side. steps: of each coarse fit. viewpoints: all around. cone: degrees from
     what a single instance has shown within which another can be recognised. models: instances that are inflated, at most. keep:
     hypotheses of each pair. tolerance: degrees within which hypotheses agree. settled: sets of poses that are fitted and compared.
-    rounds: of fit and search for all instances at the end. rate: step of the pose corrections in coarse fits."""
+    rounds: of fit and search for all instances at the end. rate: step of the pose corrections in coarse fits. depth: see `carved`."""
 
     nodes: int = 40
     steps: int = 50
@@ -256,8 +265,9 @@ class Search:
     keep: int = 4
     tolerance: float = 22.0
     settled: int = 2
-    rounds: int = 4
+    rounds: int = 3
     rate: float = 0.004
+    depth: float = 2.5
 
 
 def crops_of(views: list[View]) -> list[Crop]:
@@ -270,13 +280,16 @@ def seen_from(poses: np.ndarray) -> np.ndarray:
     return c / np.linalg.norm(c, axis=1, keepdims=True)
 
 
-def pair_hypotheses(views: list[View], crops, rings, chosen: list[int], o: Search, distance: float, seed: int, say):
-    """Rotations (S, N, K, 3, 3) that carry instance chosen[s] onto instance j in the photo, and their scores (S, N, K): every chosen
-    instance is inflated to a model, and every other one registered against it, `o.keep` ways by each of two descriptors. The scores of both
-    are shifted so that one in ten pairs has more than 0.9."""
-    kinds = ((PARTS, rings), (COLOURFUL, crop_rings(crops, COLOURFUL)))
-    shape = (len(chosen), len(views), len(kinds) * o.keep)
-    rotations, scores = np.tile(np.eye(3), (*shape, 1, 1)), np.full(shape, -1.0)
+def pair_hypotheses(views: list[View], crops, chosen: list[int], o: Search, distance: float, seed: int, say) -> dict:
+    """For each of two descriptors (PARTS, COLOURFUL): rotations (S, N, K, 3, 3) that carry instance chosen[s] onto instance j in the
+    photo, and their scores (S, N, K).
+
+    Every chosen instance is inflated to a model, and every other one registered against it, `o.keep` ways. The scores of a descriptor are
+    shifted so that one in ten pairs has more than 0.9: then the two can be compared.
+    """
+    rings = {parts: crop_rings(crops, parts) for parts in (PARTS, COLOURFUL)}
+    shape = (len(chosen), len(views), o.keep)
+    out = {parts: (np.tile(np.eye(3), (*shape, 1, 1)), np.full(shape, -1.0)) for parts in rings}
     directions = directions_around(o.viewpoints, seed)
     for s, k in enumerate(chosen):
         pose = first_pose(views[k], distance)
@@ -284,19 +297,16 @@ def pair_hypotheses(views: list[View], crops, rings, chosen: list[int], o: Searc
         close = directions @ seen_from(pose[None])[0] >= np.cos(np.radians(o.cone))
         cameras = views_from(directions[close], max(2.0, distance))
         rgb, alpha = albedo_render(model)(cameras)
-        for n, (parts, own) in enumerate(kinds):
-            found = search(crops, Gallery(cameras, rings_of(rgb, alpha, parts=parts)), keep=o.keep, rings=own, apart=25.0)
-            part = slice(n * o.keep, (n + 1) * o.keep)
-            rotations[s, :, part] = np.swapaxes(
-                found.poses[..., :3, :3], -1, -2
-            )  # the model's axes are the photo's: pose^-1 turns k onto j
-            scores[s, :, part] = found.scores
-        scores[s, k] = -1.0
+        for parts, (rotations, scores) in out.items():
+            gallery = Gallery(cameras, rings_of(rgb, alpha, parts=parts))
+            found = search(crops, gallery, keep=o.keep, rings=rings[parts], apart=25.0)
+            rotations[s] = np.swapaxes(found.poses[..., :3, :3], -1, -2)  # the model's axes are the photo's: pose^-1 turns k onto j
+            scores[s] = found.scores
+            scores[s, k] = -1.0
         say(s + 1, len(chosen))
-    for n in range(len(kinds)):
-        part = scores[..., n * o.keep : (n + 1) * o.keep]
-        part[part > -1] += 0.9 - np.quantile(part[..., 0][part[..., 0] > -1], 0.9)
-    return rotations, scores
+    for _, scores in out.values():
+        scores[scores > -1] += 0.9 - np.quantile(scores[..., 0][scores[..., 0] > -1], 0.9)
+    return out
 
 
 def consistent(rotations: np.ndarray, scores: np.ndarray, chosen: list[int], tolerance: float, links=()) -> list[tuple[float, np.ndarray]]:
@@ -307,7 +317,7 @@ def consistent(rotations: np.ndarray, scores: np.ndarray, chosen: list[int], tol
     onto j, weight), ...) from matching.
     """
     n, sigma = rotations.shape[1], np.radians(tolerance)
-    weight = np.exp((scores - 1) / 0.04)  # a good score means much: the score of a wrong pose is often near-by
+    weight = np.exp((scores - 1) / 0.06)  # a good score means much: that of a wrong pose is often near-by
     edges: dict[tuple[int, int], list[tuple[np.ndarray, float]]] = {}
     for s, k in enumerate(chosen):
         for j in range(n):
@@ -369,7 +379,7 @@ def poses_of(views: list[View], orientations: np.ndarray, distance: float) -> np
     return np.array(out)
 
 
-def settle(views, crops, rings, poses, scores, o: Search, rounds: int, *, wide: bool, seed: int, say=lambda text: None):
+def settle(views, crops, rings, poses, scores, o: Search, rounds: int, *, wide: bool, seed: int, parts=PARTS, say=lambda text: None):
     """Rounds of a coarse fit and a search for better poses by rendering it; (poses, scores).
 
     scores: of the poses so far, or None: then all instances shape the model. Otherwise only those that agree well do (see `trusted`), so
@@ -382,18 +392,18 @@ def settle(views, crops, rings, poses, scores, o: Search, rounds: int, *, wide: 
         nodes = o.nodes if turn < 2 else round(1.3 * o.nodes)
         some = [views[k] for k in use]
         # a hull that is too fat misleads more than one that is too thin
-        values = carved(some, poses[use], nodes, 0.3 if scores is None else 0.15)
+        values = carved(some, poses[use], nodes, 0.3 if scores is None else 0.15, o.depth)
         steps = o.steps + 10 * turn
         model, poses[use] = fit_model(some, poses[use], values, steps, refine_cameras=o.rate, seed=seed + turn)
         render = albedo_render(model)
-        poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 8.0, 4.0, 2.0), parts=PARTS)
+        poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 8.0, 4.0, 2.0), parts=parts)
         moved = np.zeros(n, bool)
         if wide:
             far = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
-            gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed + turn), far), PARTS)
+            gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed + turn), far), parts)
             found = search(crops, gallery, keep=3, rings=rings)
             for k in range(3):
-                other, also = refine(crops, found.poses[:, k], render, rings=rings, steps=(0, 4.0, 2.0), parts=PARTS)
+                other, also = refine(crops, found.poses[:, k], render, rings=rings, steps=(0, 4.0, 2.0), parts=parts)
                 better = also > scores + 0.004
                 poses, scores = np.where(better[:, None, None], other, poses), np.where(better, also, scores)
                 moved |= better
@@ -413,19 +423,21 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
 
     links: see `consistent`.
     """
-    crops = crops_of(views)
-    rings = crop_rings(crops, PARTS)
     distance = frame_scale(views)
     if len(views) == 1:
         return first_pose(views[0], distance)[None], np.ones(1)
+    crops = crops_of(views)
     order = sorted(range(len(views)), key=lambda k: -views[k].seen * np.sqrt(views[k].mask.sum()) / views[k].camera.fx)
     chosen = order[: o.models]
-    rotations, scores = pair_hypotheses(views, crops, rings, chosen, o, distance, seed, step)
-    sets = distinct(consistent(rotations, scores, chosen, o.tolerance, links), o.settled)
+    guesses = pair_hypotheses(views, crops, chosen, o, distance, seed, step)
+    judged = [(parts, consistent(*guesses[parts], chosen, o.tolerance, links)) for parts in guesses]
+    parts, sets = max(judged, key=lambda x: x[1][0][0])  # the descriptor whose guesses agree more suits the object
+    rings = crop_rings(crops, parts)
     best = None
-    for support, orientations in sets:
+    for support, orientations in distinct([sets[0], *stars(*guesses[parts]), *sets[1:]], o.settled):
+        start = poses_of(views, orientations, distance)
         try:
-            poses, agreed = settle(views, crops, rings, poses_of(views, orientations, distance), None, o, 2, wide=False, seed=seed)
+            poses, agreed = settle(views, crops, rings, start, None, o, 2, wide=False, seed=seed, parts=parts)
         except ValueError:  # the silhouettes have nothing in common
             continue
         say(f"a set of poses with support {support:.2f}: mean score {agreed.mean():.3f}")
@@ -433,18 +445,29 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
             best = poses, agreed
     if best is None:
         raise ValueError("no set of poses agrees with the silhouettes")
-    return settle(views, crops, rings, *best, o, o.rounds, wide=True, seed=seed + 10, say=say)
+    return settle(views, crops, rings, *best, o, o.rounds, wide=True, seed=seed + 10, parts=parts, say=say)
+
+
+def stars(rotations: np.ndarray, scores: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """The orientations that one inflated instance alone says, best guesses only: [(mean score, (N, 3, 3))], best first. Where all are
+    seen from about one side this is better than any vote."""
+    best = scores.argmax(2)
+    mean = np.take_along_axis(scores, best[..., None], 2)[..., 0].sum(1) + 1  # its own score is -1
+    picked = np.take_along_axis(rotations, best[..., None, None, None], 2)[:, :, 0]
+    own = np.take_along_axis(scores, best[..., None], 2)[..., 0] <= -1
+    picked[own] = np.eye(3)
+    return [(float(mean[s] / max(scores.shape[1] - 1, 1)), picked[s]) for s in np.argsort(-mean)]
 
 
 def distinct(sets: list[tuple[float, np.ndarray]], most: int) -> list[tuple[float, np.ndarray]]:
-    """The first sets of orientations that differ from each other by more than their frame: a median of 15 degrees or more."""
+    """The first sets of orientations that differ from each other by more than their frame: a median of 8 degrees or more."""
     kept: list[tuple[float, np.ndarray]] = []
     for support, r in sets:
         different = True
         for _, q in kept:
             frame = nearest_rotation(np.einsum("nji,njk->ik", q, r))
             angles = np.arccos(np.clip((np.einsum("nij,nij->n", r, q @ frame) - 1) / 2, -1, 1))
-            different &= bool(np.median(angles) > np.radians(15))
+            different &= bool(np.median(angles) > np.radians(8))
         if different:
             kept.append((support, r))
         if len(kept) == most:
