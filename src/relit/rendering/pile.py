@@ -104,3 +104,40 @@ def instance_ids(scene: Scene, pile: Pile, camera: Camera, samples: int = 9) -> 
         votes[index, np.minimum(which.numpy().astype(np.int64), pile.count)] += 1
     best = votes.argmax(1)
     return np.where(best == pile.count, -1, best).astype(np.int32).reshape(camera.height, camera.width)
+
+
+def joined(a: Mesh, material_a: Material, b: Mesh, material_b: Material) -> tuple[Mesh, Material]:
+    """Two objects with a material each as one mesh with one set of textures, `a` in the upper half. Both meshes in one frame; the index of
+    refraction is that of `a`."""
+    import cv2
+
+    def halves(name: str, missing):
+        planes = [getattr(m, name) for m in (material_a, material_b)]
+        if all(p is None for p in planes):
+            return None
+        planes = [np.full((1, 1, *np.shape(missing)), missing, np.float32) if p is None else np.asarray(p, np.float32) for p in planes]
+        if planes[0].ndim != planes[1].ndim:
+            planes = [np.repeat(p[..., None], 3, -1) if p.ndim == 2 else p for p in planes]
+        height, width = (max(p.shape[k] for p in planes) for k in (0, 1))
+        size = (width, max(height, LEAST_ROWS))
+        return np.concatenate([cv2.resize(p, size, interpolation=cv2.INTER_NEAREST) for p in planes], 0)
+
+    uvs = [np.zeros((len(m.vertices), 2), np.float32) if m.uvs is None else np.asarray(m.uvs, np.float32) for m in (a, b)]
+    uvs = [np.stack([uv[:, 0], np.clip(uv[:, 1], 0, 1) * 0.5 + 0.5 * k], -1) for k, uv in enumerate(uvs)]
+    normals = [m.normals if m.normals is not None else vertex_normals(m) for m in (a, b)]
+    mesh = Mesh(
+        np.concatenate([a.vertices, b.vertices]).astype(np.float32),
+        np.concatenate([a.faces, np.asarray(b.faces) + len(a.vertices)]).astype(np.int32),
+        np.concatenate(normals).astype(np.float32),
+        np.concatenate(uvs).astype(np.float32),
+    )
+    specular = halves("specular", 1.0)
+    material = Material(
+        halves("base_color", (0.5, 0.5, 0.5)),
+        halves("roughness", 0.5),
+        halves("metallic", 0.0),
+        material_a.ior,
+        specular,
+        halves("normal", (0.0, 0.0, 1.0)),
+    )
+    return mesh, material

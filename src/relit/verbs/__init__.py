@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from relit.verbs.after import do_export, do_relight, do_view, export_flags, relight_flags, view_flags
+from relit.verbs.change import do_edit, do_insert, edit_flags, insert_flags
 from relit.verbs.jobs import (
     demo_flags,
     do_demo,
@@ -29,6 +30,8 @@ VERBS: dict[str, Verb] = {
     "reconstruct": Verb("photos into a relightable asset; giving the same command again resumes", reconstruct_flags, do_reconstruct),
     "export": Verb("the asset as glb, obj, ply, a Mitsuba scene, or a page to send", export_flags, do_export),
     "relight": Verb("pictures of the asset under another light", relight_flags, do_relight),
+    "edit": Verb("the asset with another material or an instance less, and the photo so changed", edit_flags, do_edit),
+    "insert": Verb("a model put into the photo of a duplicates run, under the recovered light", insert_flags, do_insert),
     "view": Verb("the page: object, light, photos against renders, a run at work", view_flags, do_view),
     "evaluate": Verb("every figure that a known truth allows, with its definition", evaluate_flags, do_evaluate),
     "synthesize": Verb("renders a capture with known truth", synthesize_flags, do_synthesize, SYNTHESIZERS),

@@ -1,0 +1,191 @@
+"""The photo of a pile of duplicates, changed: another material, an instance taken away, a new object put in, under the recovered light.
+
+Differential rendering (Debevec 1998, Sec. 4): where the changed thing itself is seen, the picture is rendered; everywhere else the photo
+stays, plus what the change does to it (render after minus render before): contact shadows and inter-reflections fall on what was
+photographed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from relit.asset.asset import load_asset, save_asset
+from relit.asset.gltf import read_asset_file
+from relit.conventions import move_points, scale_of, similarity
+from relit.errors import EXIT_USAGE, UserError
+from relit.images import read_image, write_srgb
+from relit.rendering.mitsuba_scene import build_scene, render
+from relit.rendering.pile import build_pile, instance_ids, joined
+from relit.scene import Asset, Camera, Mesh
+
+
+def edit(
+    run: str | Path,
+    out: str | Path,
+    *,
+    photo: str | Path | None = None,
+    base_color: Sequence[float] | None = None,
+    tint: Sequence[float] | None = None,
+    roughness: float | None = None,
+    metallic: float | None = None,
+    remove: Sequence[int] = (),
+    spp: int = 64,
+    seed: int = 0,
+) -> list[Path]:
+    """Write an asset folder `out` with another material and without the instances `remove` (labels); with `photo`, also the changed photo,
+    `out`/photo.png. Returns what was written.
+
+    base_color: (3,) linear, replaces the texture; tint: (3,), multiplies it. roughness, metallic: constants that replace the maps.
+    """
+    out, asset = Path(out), load_asset(run)
+    _in_range({"roughness": roughness, "metallic": metallic})
+    known = {i.label for i in asset.instances if i.registered}
+    for label in remove:
+        if label not in known:
+            raise UserError(
+                f"no registered instance has the label {label}", f"labels: {', '.join(map(str, sorted(known)))}", code=EXIT_USAGE
+            )
+    material = asset.material
+    if base_color is not None:
+        material = replace(material, base_color=np.broadcast_to(np.float32(base_color), material.base_color.shape).copy())
+    if tint is not None:
+        material = replace(material, base_color=np.clip(material.base_color * np.float32(tint), 0, 1).astype(np.float32))
+    for name, value in (("roughness", roughness), ("metallic", metallic)):
+        if value is not None:
+            material = replace(material, **{name: np.full_like(getattr(material, name), value)})
+    kept = tuple(i for i in asset.instances if i.label not in remove)
+    if asset.instances and not any(i.registered for i in kept):
+        raise UserError("nothing would be left", fix="keep at least one instance", code=EXIT_USAGE)
+    changed = replace(asset, material=material, instances=kept)
+    written = [save_asset(out, changed)]
+    if photo is not None:
+        camera, picture = _photo(asset, photo)
+        before, ids = _rendered(asset, camera, spp, seed)
+        after, new_ids = _rendered(changed, camera, spp, seed)
+        same = material is asset.material
+        labels = np.array([i.label for i in asset.instances if i.registered] + [-1])
+        gone = np.isin(labels[ids], list(remove))
+        own = gone if same else gone | (new_ids >= 0)
+        write_srgb(out / "photo.png", np.clip(np.where(own[..., None], after, picture + after - before), 0, 1))
+        written.append(out / "photo.png")
+    return written
+
+
+def insert(
+    run: str | Path,
+    model: str | Path,
+    out: str | Path,
+    *,
+    photo: str | Path,
+    at: tuple[float, float],
+    size: float = 1.0,
+    turn: float = 0.0,
+    spp: int = 128,
+    seed: int = 0,
+) -> Path:
+    """Put a model (.glb, .gltf, .obj; or an asset folder) into the photo, standing on the ground at pixel `at` (x, y), and write the
+    picture `out`.
+
+    size: its bounding sphere, in that of the recovered object. turn: degrees about the vertical.
+    """
+    asset, out = load_asset(run), Path(out)
+    if asset.ground is None or asset.environment is None:
+        raise UserError(
+            "the asset knows no ground to stand on",
+            "few instances, or none that touch one plane",
+            "insert needs the run of a duplicates capture in which a ground was found",
+        )
+    if not 0.01 <= size <= 100:
+        raise UserError(f"--size {size} is outside 0.01 to 100", code=EXIT_USAGE)
+    model = Path(model)
+    mesh, material = (lambda a: (a.mesh, a.material))(load_asset(model)) if model.is_dir() else read_asset_file(model)
+    camera, picture = _photo(asset, photo)
+    x, y = at
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        raise UserError(f"--at {x:g},{y:g} lies outside the photo of {camera.width} x {camera.height} pixels", code=EXIT_USAGE)
+    placed = standing(mesh, asset, camera, at, size, turn)
+    poses = [i.world_from_object for i in asset.instances if i.registered]
+    pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
+    before = render(build_scene(pile.mesh, pile.material, np.eye(4), asset.environment), camera, spp=spp, seed=seed)[..., :3]
+    whole, materials = joined(pile.mesh, pile.material, placed, material)
+    scene = build_scene(whole, materials, np.eye(4), asset.environment)
+    after = render(scene, camera, spp=spp, seed=seed)[..., :3]
+    cover = coverage(scene, len(pile.mesh.faces), camera)[..., None]
+    write_srgb(out, np.clip(cover * after + (1 - cover) * (picture + after - before), 0, 1))
+    return out
+
+
+def standing(mesh: Mesh, asset: Asset, camera: Camera, at, size: float, turn: float) -> Mesh:
+    """The mesh in the world: its lowest point on the ground where the ray through pixel `at` meets it, +Y along the ground's normal."""
+    from relit.cameras.se3 import exp_so3, rotation_from
+
+    g = asset.ground
+    ray = camera.world_from_camera[:3, :3] @ np.array([(at[0] - camera.cx) / camera.fx, (at[1] - camera.cy) / camera.fy, 1.0])
+    down = float(ray @ g.normal)
+    away = float((np.asarray(g.point) - camera.centre) @ g.normal) / (down if abs(down) > 1e-9 else 1e-9)
+    if away <= 0:
+        raise UserError(
+            "the ray through --at does not meet the ground", "it goes above the horizon", "choose a lower pixel", code=EXIT_USAGE
+        )
+    v = np.asarray(mesh.vertices, np.float64)
+    own = np.linalg.norm(v - (v.min(0) + v.max(0)) / 2, axis=1).max()
+    o = np.asarray(asset.mesh.vertices, np.float64)
+    radius = np.linalg.norm(o - (o.min(0) + o.max(0)) / 2, axis=1).max() * scale_of(asset.world_from_asset)
+    foot = np.array([(v[:, 0].min() + v[:, 0].max()) / 2, v[:, 1].min(), (v[:, 2].min() + v[:, 2].max()) / 2])
+    rotation = rotation_from(np.array([0.0, 1.0, 0.0]), g.normal) @ exp_so3(np.array([0, np.radians(turn), 0]))
+    s = size * radius / max(own, 1e-12)
+    pose = similarity(rotation, camera.centre + away * ray - s * rotation @ foot, s)
+    normals = None if mesh.normals is None else (np.asarray(mesh.normals) @ rotation.T).astype(np.float32)
+    return replace(mesh, vertices=move_points(pose, v).astype(np.float32), normals=normals)
+
+
+def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.ndarray:
+    """(H, W) share of each pixel in which a face from `first_face` on is seen."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from relit.rendering.mitsuba_scene import _camera_rays
+
+    pixels = camera.width * camera.height
+    total = np.zeros(pixels)
+    for k in range(samples):
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(dr.opaque(mi.UInt32, 500 + k), pixels)
+        with dr.suspend_grad():
+            ray, _ = _camera_rays(scene, camera, sampler, pixels)
+            pi = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
+            total += (pi.is_valid() & (pi.prim_index >= first_face)).numpy()
+    return (total / samples).reshape(camera.height, camera.width)
+
+
+def _rendered(asset: Asset, camera: Camera, spp: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """The pile's picture (H, W, 3) and which registered instance each pixel shows, -1 for none."""
+    poses = [i.world_from_object for i in asset.instances if i.registered] or [asset.world_from_asset]
+    pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
+    scene = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
+    return render(scene, camera, spp=spp, seed=seed)[..., :3], instance_ids(scene, pile, camera)
+
+
+def _photo(asset: Asset, photo: str | Path) -> tuple[Camera, np.ndarray]:
+    """The photo's camera and its linear pixels. Raises UserError when they do not belong together."""
+    if asset.environment is None or not asset.cameras:
+        raise UserError("the asset has no camera or no light of its own", fix="give a run of `relit reconstruct`")
+    picture, camera = read_image(Path(photo)).rgb, asset.cameras[0][1]
+    h, w = picture.shape[:2]
+    if abs(w / h - camera.width / camera.height) > 0.01:
+        raise UserError(
+            f"the photo is {w} x {h} pixels, the asset's camera {camera.width} x {camera.height}",
+            "it is another photo",
+            f"give the photo that the run was made from: {photo}",
+        )
+    return camera.resized(w, h), picture
+
+
+def _in_range(values: dict[str, float | None]) -> None:
+    for name, value in values.items():
+        if value is not None and not 0 <= value <= 1:
+            raise UserError(f"--{name} {value} is outside 0 to 1", code=EXIT_USAGE)

@@ -1,0 +1,82 @@
+"""edit, insert: a recovered pile with another material, an instance less, a new object."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from relit.errors import EXIT_USAGE, UserError
+from relit.verbs.parser import DEVICES, Parser, free, out_flag, path_in
+
+
+def colour(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(p) for p in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(0 <= v <= 100 for v in values):
+        raise argparse.ArgumentTypeError(f"'{text}' is not R,G,B, each at least 0")
+    return values
+
+
+def pixel(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(p) for p in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not X,Y")
+    return values
+
+
+def edit_flags(parser: Parser) -> None:
+    path_in(parser, "run", "run folder or asset folder")
+    out_flag(parser, "asset folder to write; with --photo also photo.png in it")
+    add, more = parser.common.add_argument, parser.more.add_argument
+    add("--photo", type=Path, default=None, metavar="FILE", help="the photo of a duplicates run: it is changed as well")
+    add("--tint", type=colour, default=None, metavar="R,G,B", help="multiplies the base colour")
+    add("--base-color", type=colour, default=None, metavar="R,G,B", help="linear, in place of the texture")
+    add("--roughness", type=float, default=None, help="a constant in place of the map")
+    add("--metallic", type=float, default=None, help="a constant in place of the map")
+    add("--remove", type=int, nargs="*", default=[], metavar="LABEL", help="instances to take away")
+    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    more("--spp", type=int, default=64, help="samples a pixel (default 64)")
+    more("--overwrite", action="store_true", help="replace what is there")
+
+
+def do_edit(args) -> None:
+    if args.base_color is not None and max(args.base_color) > 1:
+        raise UserError("--base-color has a value above 1", "a surface reflects no more than it receives", code=EXIT_USAGE)
+    free(args.out, args.overwrite)
+    from relit.device import use_device
+
+    use_device(args.device)
+    from relit.edit import edit
+
+    names = ("photo", "tint", "base_color", "roughness", "metallic", "remove", "spp")
+    for path in edit(args.run, args.out, **{name: getattr(args, name) for name in names}):
+        print(path)
+
+
+def insert_flags(parser: Parser) -> None:
+    path_in(parser, "run", "run folder or asset folder of a duplicates capture")
+    out_flag(parser, "picture to write")
+    add, more = parser.common.add_argument, parser.more.add_argument
+    add("--photo", type=Path, required=True, metavar="FILE", help="the photo of the run")
+    add("--model", type=Path, required=True, metavar="FILE", help=".glb, .gltf, .obj or an asset folder")
+    add("--at", type=pixel, required=True, metavar="X,Y", help="pixel of the photo where it stands on the ground")
+    add("--size", type=float, default=1.0, help="of its bounding sphere, in that of the recovered object (default 1)")
+    add("--turn", type=float, default=0.0, metavar="DEGREES", help="about the vertical")
+    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    more("--spp", type=int, default=128, help="samples a pixel (default 128)")
+    more("--overwrite", action="store_true", help="replace what is there")
+
+
+def do_insert(args) -> None:
+    free(args.out, args.overwrite)
+    from relit.device import use_device
+
+    use_device(args.device)
+    from relit.edit import insert
+
+    print(insert(args.run, args.model, args.out, photo=args.photo, at=args.at, size=args.size, turn=args.turn, spp=args.spp))

@@ -1,0 +1,87 @@
+"""The photo of a pile, changed: on a made-up asset whose photo is its own rendering."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relit.asset.asset import load_asset, save_asset
+from relit.cameras.se3 import look_at
+from relit.capture.procedural import pawn
+from relit.conventions import similarity
+from relit.edit import edit, insert
+from relit.errors import UserError
+from relit.images import read_image, write_srgb
+from relit.rendering.mitsuba_scene import build_scene, render
+from relit.rendering.pile import build_pile
+from relit.scene import Asset, Camera, Ground, Instance
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """(asset folder, photo): two objects on the ground, lit from one side."""
+    folder = tmp_path_factory.mktemp("edit")
+    mesh, material = pawn(rows=24, columns=24, texture=32)
+    poses = [similarity(np.eye(3), [-1.0, 0, 0]), similarity(np.eye(3), [1.0, 0, 0])]
+    ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 12.0, np.array([0.4, 0.4, 0.4]))
+    environment = np.full((8, 16, 3), 0.3, np.float32)
+    environment[1:3, 2:5] = 6.0
+    camera = Camera(72, 54, 80.0, 80.0, 36.0, 27.0, look_at([0, 3.5, 5.0], (0, 0.4, 0)))
+    instances = (Instance(10, poses[0]), Instance(20, poses[1]))
+    asset = Asset(mesh, material, poses[0], environment, (("photo.png", camera),), {}, None, instances, ground)
+    pile = build_pile(mesh, material, poses, ground)
+    picture = render(build_scene(pile.mesh, pile.material, np.eye(4), environment), camera, spp=64, seed=9)
+    write_srgb(folder / "photo.png", np.clip(picture[..., :3], 0, 1))
+    return save_asset(folder / "asset", asset), folder / "photo.png"
+
+
+def test_the_photo_changes_only_where_the_object_and_what_it_lights_are(run, tmp_path):
+    folder, photo = run
+    edit(folder, tmp_path / "red", photo=photo, base_color=(0.8, 0.05, 0.05), spp=16)
+    before, after = read_image(photo).rgb, read_image(tmp_path / "red" / "photo.png").rgb
+    assert np.abs(after - before)[:6].max() < 0.06  # far from the objects
+    changed = np.abs(after - before).max(-1) > 0.15
+    assert changed.mean() > 0.03 and (after[changed][:, 0] > after[changed][:, 1]).mean() > 0.9
+    assert np.allclose(load_asset(tmp_path / "red").material.base_color.reshape(-1, 3)[0], [0.8, 0.05, 0.05], atol=0.01)
+
+
+def test_a_removed_instance_leaves_ground_without_its_shadow(run, tmp_path):
+    folder, photo = run
+    edit(folder, tmp_path / "one", photo=photo, remove=[20], spp=32)
+    after, asset = read_image(tmp_path / "one" / "photo.png").rgb, load_asset(folder)
+    camera = asset.cameras[0][1]
+    u, v, _ = camera.project(np.array([1.0, 0.6, 0.0])).astype(int)
+    place = after[v - 2 : v + 3, u - 2 : u + 3].reshape(-1, 3)
+    assert np.ptp(place.mean(0)) < 0.06  # grey ground, not the coloured object
+    assert [i.label for i in load_asset(tmp_path / "one").instances] == [10]
+    with pytest.raises(UserError, match="label 30"):
+        edit(folder, tmp_path / "none", remove=[30])
+    with pytest.raises(UserError, match="nothing would be left"):
+        edit(folder, tmp_path / "none", remove=[10, 20])
+
+
+def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):
+    folder, photo = run
+    camera = load_asset(folder).cameras[0][1]
+    foot = camera.project(np.array([0.0, 0.0, 0.9]))[:2]
+    out = insert(folder, folder, tmp_path / "new.png", photo=photo, at=tuple(foot), size=0.6, spp=32)
+    before, after = read_image(photo).rgb, read_image(out).rgb
+    u, v = foot.astype(int)
+    assert np.abs(after - before)[v - 8 : v - 1, u - 2 : u + 3].mean() > 0.04  # its body
+    near = (after - before)[v : v + 3, u - 5 : u + 6].mean()
+    assert near < 0.002  # contact shadow: no brighter than before
+    assert np.abs(after - before)[:5].max() < 0.06
+    with pytest.raises(UserError, match="outside the photo"):
+        insert(folder, folder, tmp_path / "x.png", photo=photo, at=(500, 5))
+    with pytest.raises(UserError, match="does not meet the ground"):
+        look_up = camera.with_pose(look_at([0, 1, 5.0], (0, 3, 0)))
+        from relit.edit import standing
+
+        asset = load_asset(folder)
+        standing(asset.mesh, asset, look_up, (36, 5), 1.0, 0.0)
+
+
+def test_another_photo_is_refused(run, tmp_path):
+    write_srgb(tmp_path / "wide.png", np.zeros((20, 80, 3), np.float32))
+    with pytest.raises(UserError, match="another photo"):
+        edit(run[0], tmp_path / "a", photo=tmp_path / "wide.png", roughness=0.5)
