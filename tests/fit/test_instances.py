@@ -10,8 +10,9 @@ import pytest
 
 from relit.cameras.se3 import exp_so3, nearest_rotation, rotation_angle
 from relit.conventions import similarity
-from relit.fit.duplicates import find_ground
-from relit.fit.instances import carved, consistent, distinct, first_pose, frame_scale, inflated, pixel_bank, trusted, views_of
+from relit.fit.instance_search import consistent, distinct, trusted
+from relit.fit.instances import carved, first_pose, frame_scale, inflated, pixel_bank, views_of
+from relit.fit.pile_scene import find_ground
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 

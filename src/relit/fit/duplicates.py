@@ -1,7 +1,7 @@
 """One photo of several identical objects under an unknown light -> the object, its poses, its material, the light. The recipe of
 `duplicates`.
 
-    poses     a virtual camera for each instance; matching, and search by rendering     cameras/duplicates.py, fit/instances.py
+    poses     a virtual camera for each instance; matching, and search by rendering     cameras/duplicates.py, fit/instance_search.py
     volume     one signed distance field in the object's frame, seen by all virtual cameras; poses move with it      fit/volume.py
     mesh       zero level set, decimated; texture atlas; the ground that the instances stand on
     surface    one material for all instances and one environment, light traced past all instances and the ground     fit/surface.py
@@ -20,9 +20,10 @@ import numpy as np
 from relit.cameras.se3 import nearest_rotation, rotation_from
 from relit.conventions import move_points, similarity
 from relit.errors import EXIT_FAILED, UserError, did_you_mean
-from relit.fit.instances import COARSE, Search, View, carved, move_poses, moved_poses, pixel_bank, place, views_of
+from relit.fit.instance_search import Search, place
+from relit.fit.instances import COARSE, View, carved, move_poses, moved_poses, pixel_bank, views_of
 from relit.fit.multiview import run_arrays, vertex_areas
-from relit.fit.pixels import make_bank
+from relit.fit.pile_scene import find_ground, ground_colour, photo_bank, scene_mesh
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
@@ -30,7 +31,6 @@ from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.materials.field import normal_map, pictures
-from relit.rendering.pile import ground_square
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.rendering.transport import TraceableMesh
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh
@@ -41,8 +41,6 @@ FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
 COST = {"draft": (60.0, 1.0e9), "standard": (300.0, 2.0e9), "high": (1200.0, 3.0e9)}
 AGREES = 0.2  # an instance whose score lies further below the median did not find its place
-TOUCHES = 0.08  # unit lengths within which an instance counts as touching the ground
-GROUND_ROWS = 96
 # weight of a rotation from matching, as of a guess with a score of .82: few views and a long lens leave tilt and depth uncertain by tens
 # of degrees
 LINKED = 0.05
@@ -190,7 +188,7 @@ def poses_stage(pixels, camera: Camera, run, options: DuplicatesOptions, seed: i
 
 
 def matched(pixels, camera: Camera, run, options: DuplicatesOptions, seed: int) -> tuple:
-    """Links of pairs by rotation-swept feature matching: (i, j, rotation of i onto j, weight), see `fit.instances.consistent`."""
+    """Links of pairs by rotation-swept feature matching: (i, j, rotation of i onto j, weight), see `fit.instance_search.consistent`."""
     from relit.cameras.duplicates import find_features, link_instances, map_instances
     from relit.cameras.sfm import _quiet
     from relit.device import load_pycolmap
@@ -279,31 +277,6 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     return parts
 
 
-def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Point and unit normal, (2, 3), in the photo's frame (unit lengths) of the plane that most instances touch with all of them on the
-    camera's side; (0, 3) where fewer than three touch one."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    standing = [move_points(np.linalg.inv(p), vertices[:: max(1, len(vertices) // 4000)]) for p in poses]
-    if len(standing) < 3:
-        return np.zeros((0, 3))
-    try:
-        hull = ConvexHull(np.concatenate(standing))
-    except QhullError:
-        return np.zeros((0, 3))
-    best, found = 2, np.zeros((0, 3))
-    for normal, offset in {tuple(np.round(e, 3)): (e[:3], e[3]) for e in hull.equations}.values():
-        up = -normal
-        if -offset <= 0:  # the camera (the origin) must stand above
-            continue
-        gaps = np.array([(s @ up - offset).min() for s in standing])
-        touching = int((gaps < TOUCHES).sum())
-        if touching > best:
-            lowest = np.array([s[np.argmin(s @ up)] for s, g in zip(standing, gaps, strict=True) if g < TOUCHES])
-            best, found = touching, np.stack([lowest.mean(0) - up * ((lowest - lowest.mean(0)) @ up).max(), up])
-    return found
-
-
 # ---------------------------------------------------------------- material and light
 
 
@@ -342,68 +315,6 @@ def surface_stage(pixels, camera: Camera, views, mesh: Mesh, parts, run, options
         }
         stage.save("maps", **maps)
     return maps
-
-
-def scene_mesh(mesh: Mesh, parts, standing, scene_from_photo, pixels, camera: Camera, *, alone: bool) -> tuple[Mesh, np.ndarray]:
-    """All instances and the ground as one mesh in the scene frame, and the radiance (V, 3) of its vertices. Faces with negative texture
-    coordinates only block (the ground). alone: spread the instances so far apart that none shadows another, no ground."""
-    vertices, normals, faces, uvs, radiance, count = [], [], [], [], [], 0
-    for k, pose in enumerate(standing):
-        m = scene_from_photo @ pose
-        vertices.append(move_points(m, mesh.vertices))
-        normals.append(mesh.normals @ m[:3, :3].T)
-        faces.append(mesh.faces.astype(np.int64) + count)
-        uvs.append(mesh.uvs)
-        radiance.append(parts["radiance"][k] * (0.0 if alone else 1.0))
-        count += len(mesh.vertices)
-    if len(parts["plane"]) and not alone:
-        point, normal = move_points(scene_from_photo, parts["plane"][0]), scene_from_photo[:3, :3] @ parts["plane"][1]
-        reach = 4 * max(np.linalg.norm(v - point, axis=1).max() for v in vertices)
-        v, f = ground_square(Ground(point, normal, reach, np.ones(3)), GROUND_ROWS)
-        vertices.append(v)
-        normals.append(np.repeat(normal[None], len(v), 0))
-        faces.append(f + count)
-        uvs.append(-1.0 - (v - v.min(0))[:, [0, 2]] / np.maximum(np.ptp(v, axis=0)[[0, 2]], 1e-6))
-        radiance.append(ground_radiance(v, scene_from_photo, pixels, camera))
-    whole = Mesh(
-        np.concatenate(vertices).astype(np.float32),
-        np.concatenate(faces).astype(np.int32),
-        np.concatenate(normals).astype(np.float32),
-        np.concatenate(uvs).astype(np.float32),
-    )
-    return whole, np.concatenate(radiance).astype(np.float32)
-
-
-def ground_radiance(points: np.ndarray, scene_from_photo: np.ndarray, pixels, camera: Camera) -> np.ndarray:
-    """(V, 3) what the photo shows of the ground at points of the scene frame; the median of it where the photo does not."""
-    q = camera.with_pose(scene_from_photo).project(points)
-    x, y = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
-    ok = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height) & (q[:, 2] > 0)
-    x, y = np.clip(x, 0, camera.width - 1), np.clip(y, 0, camera.height - 1)
-    ok &= pixels.labels[y, x] == 0
-    free = pixels.labels == 0
-    usual = np.median(pixels.rgb[free], axis=0) if free.any() else np.full(3, 0.1)
-    return np.where(ok[:, None], pixels.rgb[y, x], usual)
-
-
-def ground_colour(pixels, camera: Camera, plane: np.ndarray) -> np.ndarray:
-    """(3,) median radiance of what is no object."""
-    free = pixels.labels == 0
-    return np.median(pixels.rgb[free], axis=0) if free.any() and len(plane) else np.zeros(3)
-
-
-def photo_bank(pixels, camera: Camera, labels: set[int], max_pixels: int):
-    """The pixels of the photo that lie inside an instance of `labels`, one pixel off its border; every n-th where there are more than
-    max_pixels."""
-    from scipy.ndimage import minimum_filter
-
-    solid = (minimum_filter(pixels.labels, 3) == pixels.labels) & np.isin(pixels.labels, list(labels))
-    bank = make_bank([camera], [pixels.rgb], [solid.astype(np.float32)], radius=1e6)
-    import mitsuba as mi
-
-    inside = np.flatnonzero(solid.ravel()).astype(np.uint32)
-    bank.candidates = mi.UInt32(inside[:: max(1, len(inside) // max_pixels)])
-    return bank
 
 
 # ---------------------------------------------------------------- asset
