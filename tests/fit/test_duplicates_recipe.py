@@ -1,0 +1,102 @@
+"""The recipe from a rendered pile to its figures, at a size at which it only has to run through: the search is replaced by the true poses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relit.asset.asset import load_asset, save_asset
+from relit.asset.gltf import write_glb
+from relit.capture import open_capture
+from relit.capture.procedural import pawn
+from relit.capture.synthetic_duplicates import heap, synthesize_duplicates
+from relit.conventions import scale_of
+from relit.errors import UserError
+from relit.evaluate.protocols import evaluate
+from relit.fit import duplicates as recipe
+from relit.images import write_linear
+from relit.run import Run
+
+
+@pytest.fixture(scope="module")
+def pile(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pile")
+    write_glb(folder / "pawn.glb", *pawn(rows=16, columns=20, texture=32))
+    light = np.full((8, 16, 3), 0.5, np.float32)
+    light[1:3, 3:6] = 8.0
+    write_linear(folder / "light.exr", light)
+    sizes = {"count": 4, "resolution": 96, "test_resolution": 32, "spp": 8, "test_spp": 8, "test_views": 2}
+    relights = [folder / "light.exr"]
+    out = synthesize_duplicates(folder / "pawn.glb", folder / "light.exr", folder / "capture", relights=relights, **sizes)
+    again = synthesize_duplicates(folder / "pawn.glb", folder / "light.exr", folder / "capture", relights=relights, **sizes)
+    assert again == out
+    with pytest.raises(UserError, match="other settings"):
+        synthesize_duplicates(folder / "pawn.glb", folder / "light.exr", out, **{**sizes, "count": 5})
+    return out
+
+
+def true_poses(pile):
+    """object_from_camera in a frame whose unit is the object's radius over .8."""
+    truth = json.loads((pile / "truth" / "truth.json").read_text())
+    camera = open_capture(pile).photos[0].camera
+    poses = []
+    for i in truth["instances"]:
+        m = np.linalg.inv(camera.world_from_camera) @ np.array(i["world_from_object"])
+        s = scale_of(m)
+        own = np.linalg.inv(m)  # asset units; the asset's bounding sphere has the radius 0.8 / s
+        own[:3, :3] *= s
+        own[:3, 3] *= s
+        poses.append(own)
+    return np.array(poses)
+
+
+def test_objects_of_a_heap_stand_on_the_ground_and_hardly_in_one_another():
+    mesh, _ = pawn(rows=16, columns=20, texture=32)
+    poses, reach = heap(mesh, 6, 0, 12.0, 1.0)
+    again, _ = heap(mesh, 6, 0, 12.0, 1.0)
+    assert np.allclose(poses, again)
+    from relit.conventions import move_points
+
+    lowest = [move_points(p, mesh.vertices)[:, 1].min() for p in poses]
+    assert min(lowest) == pytest.approx(0, abs=0.1) and min(lowest) > -0.05
+    assert all(np.linalg.norm(p[[0, 2], 3]) < reach + 1.0 for p in poses)
+
+
+def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
+    monkeypatch.setattr(recipe, "place", lambda views, search, **_: (true_poses(pile), np.full(len(views), 0.95)))
+    capture = open_capture(pile)
+    assert capture.kind == "duplicates" and len(np.unique(capture.photos[0].load().labels)) == 5
+    small = {"levels": (24,), "level_steps": (12,), "rays": 512, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
+    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=64)
+    with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
+        asset = recipe.reconstruct(capture, run, options, 0)
+        resumed = recipe.reconstruct(capture, run, options, 0)
+    assert np.allclose(asset.mesh.vertices, resumed.mesh.vertices)
+    assert len(asset.instances) == 4 and all(i.registered for i in asset.instances)
+    assert asset.ground is not None and asset.ground.normal[1] > 0.9  # the truth's ground is y = 0
+    save_asset(tmp_path / "run" / "asset", asset)
+    metrics = evaluate(tmp_path / "run", pile, spp=4)["metrics"]
+    assert metrics["rotation_before"]["value"] < 0.01 and metrics["rotation_median"]["value"] < 5
+    assert metrics["registered"]["value"] == 100 and metrics["translation_median"]["value"] < 0.6
+    assert metrics["chamfer"]["value"] < 0.1 and metrics["photo_psnr"]["value"] > 8
+    for name in ("albedo_psnr", "relit_psnr", "novel_psnr", "roughness_mse", "environment_mse"):
+        assert np.isfinite(metrics[name]["value"])
+    assert (tmp_path / "run" / "asset" / "scene.glb").is_file() and load_asset(tmp_path / "run").ground is not None
+
+
+def test_switched_off_parts_are_checked_by_name():
+    with pytest.raises(ValueError, match="Did you mean 'refinement'"):
+        replace(recipe.options_for("draft"), without=("refinment",))
+    with pytest.raises(UserError, match="not known"):
+        recipe.options_for("fast")
+
+
+def test_a_photo_without_labels_and_several_photos_are_refused(pile):
+    capture = open_capture(pile)
+    with pytest.raises(UserError, match="no labels"):
+        recipe.one_photo(replace(capture, kind=""))
+    with pytest.raises(UserError, match="2 photos"):
+        recipe.one_photo(replace(capture, photos=capture.photos * 2))
