@@ -80,9 +80,24 @@ def open_input(path: Path, job: Job) -> Capture:
     """`open_capture` with the job's wishes."""
     from relit.capture import open_capture
 
+    if job.capture == "duplicates":
+        check_labels(path)
     sphere = None if job.sphere is None else Sphere(np.array(job.sphere[:3], dtype=np.float64), float(job.sphere[3]))
     least = {} if job.capture not in RECIPES else {"min_photos": getattr(recipe_of(job.capture), "LEAST_PHOTOS", 3)}
     return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side, focal=job.focal, **least)
+
+
+def check_labels(path: Path) -> None:
+    """Raises UserError when a photo of duplicates has no labels beside it."""
+    from relit.capture.sfd import recognise
+
+    if path.exists() and recognise(path) is None:
+        name = path.stem if path.is_file() else "NAME"
+        raise UserError(
+            "no labels were found: which pixel belongs to which object is not known",
+            f"looked for {name}_labels.png, {name}_instance_seg.png, cutouts/ and COCO annotations beside the photo, and SfD's folders",
+            f"make a label image, one grey level for each object and black elsewhere (docs/duplicates.md): {path}",
+        )
 
 
 def open_as(path: Path, job: Job) -> tuple[Capture, str]:
@@ -93,7 +108,8 @@ def open_as(path: Path, job: Job) -> tuple[Capture, str]:
 
 
 # folders whose files decide as well
-BESIDE = ("sparse", "relit-corrections", "masks", "mask", "segmentations", "silhouettes", "normals", "normal")
+BESIDE = ("sparse", "relit-corrections", "masks", "mask", "segmentations", "silhouettes", "normals", "normal", "cutouts", "cut-outs",
+"instances")
 
 
 def input_digests(capture: Capture) -> dict[str, str]:
@@ -101,6 +117,10 @@ def input_digests(capture: Capture) -> dict[str, str]:
     root = capture.root if capture.root.is_dir() else capture.root.parent
     files = {root / p.name for p in (*capture.photos, *capture.held_out)}
     files |= {p for p in root.iterdir() if p.suffix.lower() in (".json", ".txt", ".npz", ".npy", ".bin")}
+    if capture.kind == "duplicates":
+        from relit.capture.sfd import SUFFIXES
+
+        files |= {p for f in list(files) for p in f.parent.iterdir() if p.stem.endswith((*SUFFIXES, "_normal"))}
     for folder in BESIDE:
         files |= set((root / folder).rglob("*"))
     names = sorted(p.relative_to(root).as_posix() for p in files if p.is_file() and p.is_relative_to(root))

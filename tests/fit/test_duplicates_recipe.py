@@ -1,4 +1,4 @@
-"""The recipe from a rendered pile to its figures, at a size at which it only has to run through: the search is replaced by the true poses."""
+"""The recipe from a rendered pile to its figures, at a size at which it only runs through: true poses stand in for the search."""
 
 from __future__ import annotations
 
