@@ -11,8 +11,17 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "src"))
 
+from relit.evaluate.collection import DEFINITIONS as COLLECTION  # noqa: E402
 from relit.evaluate.definitions import DEFINITIONS  # noqa: E402
 from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS  # noqa: E402
+from relit.evaluate.flash import FLASH_DEFINITIONS  # noqa: E402
+
+KINDS = {  # heading -> definitions
+    "": DEFINITIONS,
+    "Photos under a flash": FLASH_DEFINITIONS,
+    "Collections": COLLECTION,
+    "Photos of duplicates": DUPLICATES_DEFINITIONS,
+}
 
 HEAD = """# What the figures mean
 
@@ -28,18 +37,8 @@ How to read them:
 * **Noise.** The truth and the renders are Monte Carlo pictures: even a perfect asset does not reach infinity. RESULTS.md states that
   ceiling.
 * **Small differences** between two runs may be noise of the fit: try another `--seed` before believing one.
-
-| figure | unit | definition |
-|---|---|---|
 """
-
-
-DUPLICATES = """
-## Photos of duplicates
-
-| figure | unit | definition |
-|---|---|---|
-"""
+TABLE = "\n| figure | unit | definition |\n|---|---|---|\n"
 
 
 def rows(definitions: dict[str, tuple[str, str]]) -> str:
@@ -47,7 +46,7 @@ def rows(definitions: dict[str, tuple[str, str]]) -> str:
 
 
 def page() -> str:
-    return HEAD + rows(DEFINITIONS) + DUPLICATES + rows(DUPLICATES_DEFINITIONS)
+    return HEAD + "\n".join((f"## {kind}\n" if kind else "") + TABLE + rows(some) for kind, some in KINDS.items())
 
 
 if __name__ == "__main__":

@@ -151,6 +151,48 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     }
 
 
+def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
+    """Figures of a real photo: the photo re-rendered, and the rotations against SfD's poses where its `object_pred_pose.json` lies there.
+
+    Those poses were found by structure from motion: a reference, not the truth. Raises UserError where the capture is no such photo.
+    """
+    from relit.asset.asset import load_asset
+
+    asset, capture = load_asset(run), Path(capture)
+    values = {"photo_psnr": photo_figure(asset, capture, spp=spp, seed=seed)}
+    reference = reference_poses(capture, asset.cameras[0][1])
+    poses = {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
+    if reference:
+        values.update(pose_figures(poses, reference, dict.fromkeys(reference, 1.0)))
+        before = poses_before(Path(run), asset.cameras[0][1], list(poses))
+        if len(before) == len(poses):
+            earlier = pose_figures(before, reference, {})
+            values["rotation_before"], values["pairs_before"] = earlier["rotation_median"], earlier["rotation_pairs"]
+    metrics = {k: {"value": float(values[k]), "unit": u, "definition": d} for k, (u, d) in DUPLICATES_DEFINITIONS.items() if k in values}
+    return {"metrics": metrics, "per_view": {}}
+
+
+def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
+    """SfD's own poses world_from_object (4, 4) by label; the object of each file entry is the one at whose label its middle lies. {} where
+    there are none."""
+    from relit.capture.sfd import open_duplicates, recognise
+
+    files = [capture / name for name in ("object_pred_pose.json", "object_scale_matrix.json")]
+    source = recognise(capture)
+    if source is None or not all(f.is_file() for f in files):
+        return {}
+    labels = open_duplicates(source, focal=camera.fx).photos[0].load().labels
+    listed = json.loads(files[0].read_text())
+    middle = np.array(json.loads(files[1].read_text())["scale_matrix"], np.float64)[:3, 3]
+    out = {}
+    for name in sorted(listed):
+        pose = np.array(listed[name], np.float64)
+        u, v, z = camera.project(move_points(pose, middle))
+        if z > 0 and 0 <= u < camera.width and 0 <= v < camera.height and labels[int(v), int(u)] > 0:
+            out[int(labels[int(v), int(u)])] = pose
+    return out
+
+
 def photo_figure(asset: Asset, capture: Path, *, spp: int = 64, seed: int = 0) -> float:
     """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr)."""
     from relit.capture.sfd import open_duplicates, recognise

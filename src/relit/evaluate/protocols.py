@@ -87,7 +87,7 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     Call `relit.device.use_device` first.
     """
     from relit.asset.asset import load_asset
-    from relit.evaluate.duplicates import evaluate_duplicates, is_duplicates_truth
+    from relit.evaluate.duplicates import evaluate_duplicates, evaluate_on_photo, is_duplicates_truth
     from relit.evaluate.flash import evaluate_flash, is_flash_truth
 
     if is_duplicates_truth(truth_folder):
@@ -97,6 +97,8 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     asset = load_asset(run_or_asset)
     if has_truth(truth_folder):
         result = evaluate_asset(asset, load_truth(truth_folder), spp=spp, seed=seed)
+    elif asset.instances:
+        result = evaluate_on_photo(run_or_asset, truth_folder, spp=min(spp, 64), seed=seed)
     else:
         from relit.evaluate.photos import evaluate_on_photos
 
