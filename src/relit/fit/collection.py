@@ -19,7 +19,7 @@ import numpy as np
 from relit.capture.samurai import read_hints
 from relit.conventions import similarity
 from relit.errors import UserError, did_you_mean
-from relit.fit.collection_poses import GREY, even_colours, find_poses, schedule_of
+from relit.fit.collection_poses import GREY, PARTS, even_colours, find_poses, schedule_of
 from relit.fit.collection_surface import LightOptions, fit_collection_surface, posterior, start_collection_surface
 from relit.fit.multiview import resize, run_arrays, vertex_areas
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras
@@ -61,7 +61,8 @@ WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "l
 
 @dataclass(frozen=True)
 class CollectionOptions:
-    """side: pixels of the photos' longer side. rounds: of coarse fit and registration. keep: hypotheses of each photo that are refined
+    """side: pixels of the photos' longer side. rounds: of coarse fit and registration. polish: turns of descent and search after
+    them. keep: hypotheses of each photo that are refined
     (SAMURAI's multiplex). hints: whether quadrants or angles are used. holdout: every so many photos are set aside (0: none but those of
     held_out.json). starts: photos that growth begins from without hints. least_score: of the registration, on average, below which
     the poses are taken for wrong. levels, level_steps, rays: of the volume pass. refine_cameras:
@@ -71,11 +72,12 @@ class CollectionOptions:
 
     side: int = 400
     rounds: int = 6
+    polish: int = 0
     keep: int = 3
     hints: bool = True
     holdout: int = 0
     starts: int = 4
-    least_score: float = 0.9
+    least_score: float = 0.84
     levels: tuple[int, ...] = (64, 128)
     level_steps: tuple[int, ...] = (400, 500)
     rays: int = 6144
@@ -87,6 +89,11 @@ class CollectionOptions:
     directions: int = 32
     frozen_steps: int = 150
     without: tuple[str, ...] = ()
+
+    @property
+    def max_pixels(self) -> int:
+        """Of all photos together, for the forecast of memory: each is shrunk as it is read."""
+        return 150 * self.side**2
 
     def __post_init__(self):
         for name in self.without:
@@ -229,7 +236,16 @@ def pose_stage(shots: list[Shot], degrees: float, run, options: CollectionOption
             crops, hints = crops_of(shots), np.array([s.direction for s in shots])
             try:
                 poses, scores = find_poses(
-                    crops, hints, degrees, schedule_of(options.rounds), options.keep, options.starts, options.without, seed, run.say
+                    crops,
+                    hints,
+                    degrees,
+                    schedule_of(options.rounds),
+                    options.keep,
+                    options.starts,
+                    options.without,
+                    seed,
+                    run.say,
+                    options.polish,
                 )
             except ValueError as error:
                 why = f"{error}: the masks belong to different objects, or are wrong"
@@ -406,13 +422,13 @@ def with_median_field(shot: Shot, cameras: list[Camera]) -> Camera:
 def register(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int) -> list[Camera]:
     """The cameras of photos that the model has not seen, by search and local refinement."""
     crops, hints = crops_of(shots), np.array([s.direction for s in shots])
-    render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops)
-    gallery = make_gallery(render, views_from(directions_around(600, seed)))
+    render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops, PARTS)
+    gallery = make_gallery(render, views_from(directions_around(600, seed)), PARTS)
     prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * (np.linalg.norm(hints, axis=1) > 0.5)[:, None, None]
     found = search(crops, gallery, options.keep, rings=rings, prior=prior)
     best, score = found.poses[:, 0].copy(), np.full(len(shots), -1.0)
     for k in range(options.keep):
-        poses, scores = refine(crops, found.poses[:, k], render, rings=rings)
+        poses, scores = refine(crops, found.poses[:, k], render, rings=rings, parts=PARTS)
         better = (scores > score) & (found.scores[:, k] > -1)
         best[better], score[better] = poses[better], scores[better]
     return [s.camera.with_pose(p) for s, p in zip(shots, best, strict=True)]

@@ -11,13 +11,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from relit.cameras.se3 import look_at
 from relit.conventions import similarity
-from relit.fit.pixels import make_bank
+from relit.fit.pixels import corrected, make_bank
 from relit.fit.register import (
+    REFINE,
     Crop,
     crop_rings,
     crop_views,
@@ -33,8 +36,11 @@ from relit.fit.register import (
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import distance_of, visual_hull
 from relit.geometry.sdf import node_positions
+from relit.rendering.shade_photos import shade_photos, shade_plain, start_photo_lights
 from relit.scene import Camera
 
+PARTS = (0.6, 1.0, 0.3)  # of register.PARTS: under other lights a colour is worth less than what is dark and what is bright
+COARSE = (0, 6.0, 3.0)  # degrees; of refinements before the last
 HOPELESS = 0.8  # mean score of the first photos below which growth is given up
 HINT = 0.05  # weight of the hints' prior on scores in the first round, falling to 0
 SPREAD = 0.36  # root mean square radius of silhouettes, unit frame: the gauge of scale
@@ -108,9 +114,8 @@ def gauge(crops: list[Crop], poses: np.ndarray) -> np.ndarray:
     return out
 
 
-def coarse_model(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, tolerance: float, seed: int, limit=None) -> VolumeModel:
-    """Hull by vote and a short volume fit. limit: (n, n, n) bool, where the object may be, or None."""
-    cameras, masks = crop_views(crops, poses), [c.mask for c in crops]
+def hull_by_vote(cameras: list[Camera], masks: list[np.ndarray], nodes: int, tolerance: float, limit=None) -> np.ndarray:
+    """(n, n, n) distances of the hull at the tolerance, or at a larger one where that is next to empty. Raises ValueError when all are."""
     for more in (tolerance, 0.5 * (tolerance + 0.6), 0.6, 0.75):
         try:
             values = visual_hull(cameras, masks, nodes, tolerance=more)
@@ -119,9 +124,14 @@ def coarse_model(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, t
         except ValueError:
             continue
         if (values < 0).sum() > 50:
-            break
-    else:
-        raise ValueError("the silhouettes have nothing in common")
+            return values
+    raise ValueError("the silhouettes have nothing in common")
+
+
+def coarse_model(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, tolerance: float, seed: int, limit=None) -> VolumeModel:
+    """Hull by vote and a short volume fit. limit: (n, n, n) bool, where the object may be, or None."""
+    cameras, masks = crop_views(crops, poses), [c.mask for c in crops]
+    values = hull_by_vote(cameras, masks, nodes, tolerance, limit)
     model = start_model(values, np.full(3, GREY), None, full=False)
     bank = make_bank(cameras, [c.rgb for c in crops], masks)
     options = VolumeOptions((nodes,), (steps,), 4096, sdf_rate=0.1, feature_rate=0.03, sharpness=(0.7, 1.5), step=0.8)
@@ -131,7 +141,7 @@ def coarse_model(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, t
 def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep: int = 3):
     """Poses (P, 4, 4) and scores (P,) when each photo's direction is known to within `degrees`. directions: (P, 3) unit, zeros where a
     photo has none: such photos are registered from the second round on, wherever they fit."""
-    rings = crop_rings(crops)
+    rings = crop_rings(crops, PARTS)
     hinted = np.linalg.norm(directions, axis=1) > 0.5
     poses = np.array([pose_towards(c, d if h else [0, 0, 1.0]) for c, d, h in zip(crops, directions, hinted, strict=True)])
     rounds, used, scores = len(schedule.nodes), np.flatnonzero(hinted), np.zeros(len(crops))
@@ -139,26 +149,67 @@ def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, 
         some = [crops[k] for k in used]
         model = coarse_model(some, gauge(crops, poses)[used], schedule.nodes[i], schedule.steps[i], schedule.tolerance[i], seed + i)
         render = volume_render(model)
-        gallery = make_gallery(render, views_from(directions_around(schedule.views[i], seed + i)))
+        gallery = make_gallery(render, views_from(directions_around(schedule.views[i], seed + i)), PARTS)
         prior = HINT * (1 - i / rounds) * hint_prior(gallery, directions, degrees, 15.0) * hinted[:, None, None]
         allowed = near(gallery, directions, degrees) | ~hinted[:, None]
         found = search(crops, gallery, keep, rings=rings, prior=prior, allowed=allowed)
         poses, scores = found.poses[:, 0], found.scores[:, 0]
         if i > 0:
-            poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1)
+            last = i == rounds - 1
+            poses, scores = best_refined(crops, found, render, rings, keep if last else 1, REFINE if last else COARSE)
         used = np.arange(len(crops)) if len(used) == len(crops) else np.flatnonzero(hinted | (scores > np.median(scores[hinted])))
         say(f"round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
     return gauge(crops, poses), scores
 
 
-def best_refined(crops, found, render, rings, keep: int):
+def best_refined(crops, found, render, rings, keep: int, steps=REFINE):
     """Refine the first `keep` hypotheses of each photo, and take the best."""
     best, score = found.poses[:, 0].copy(), np.full(len(crops), -1.0)
     for k in range(min(keep, found.poses.shape[1])):
-        poses, scores = refine(crops, found.poses[:, k], render, rings=rings)
+        poses, scores = refine(crops, found.poses[:, k], render, rings=rings, steps=steps, parts=PARTS)
         better = (scores > score) & (found.scores[:, k] > -1)
         best[better], score[better] = poses[better], scores[better]
     return best, score
+
+
+def descended(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed: int) -> tuple[VolumeModel, np.ndarray]:
+    """A model with one small light per photo, fitted with the poses free; and the poses. Focal lengths stay."""
+    cameras, masks = crop_views(crops, gauge(crops, poses)), [c.mask for c in crops]
+    model = start_model(hull_by_vote(cameras, masks, nodes, 0.12), np.full(3, GREY), None, full=False)
+    model.reflections, model.rates = start_photo_lights(np.full((len(crops), 3), GREY), GREY)
+    model.appearance = shade_photos
+    bank = make_bank(cameras, [c.rgb for c in crops], masks)
+    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    options = VolumeOptions((nodes,), (steps,), 4096, feature_rate=0.03, sharpness=(1.0, 3.0), step=0.8, refine_cameras=0.005)
+    fit_volume(bank, model, options, Quiet(), seed)
+    numbers = np.array(bank.corrections).reshape(-1, 7)
+    numbers[:, 6] = 0
+    found = corrected(cameras, numbers.ravel())
+    moved = [c.world_from_camera @ np.linalg.inv(crop.camera.world_from_camera) for c, crop in zip(found, crops, strict=True)]
+    return model, np.array(moved)
+
+
+def polish(crops: list[Crop], poses: np.ndarray, directions: np.ndarray, degrees: float, keep: int, seed: int, say, cycles: int):
+    """Descend, then search again in the sharper model: descent brings most photos to within a degree or two, the search the others."""
+    rings, scores = crop_rings(crops, PARTS), np.zeros(len(crops))
+    hinted = np.linalg.norm(directions, axis=1) > 0.5
+    for i in range(cycles):
+        model, poses = descended(crops, poses, 48, 200, seed + 200 + i)
+        render = volume_render(replace(model, appearance=shade_plain))
+        gallery = make_gallery(render, views_from(directions_around(500, seed + 200 + i)), PARTS)
+        prior = 0.5 * HINT * hint_prior(gallery, directions, degrees, 45.0) * hinted[:, None, None]
+        found = search(crops, gallery, keep, rings=rings, prior=prior)
+        own, height = refine(crops, poses, render, rings=rings, steps=(0, 1.5), parts=PARTS)
+        other, scores = best_refined(crops, found, render, rings, keep, COARSE)
+        stays = height + 0.005 >= scores
+        poses = np.where(stays[:, None, None], own, other)
+        scores = np.maximum(height, scores)
+        say(
+            f"descent and search, {i + 1} of {cycles}: mean score {scores.mean():.3f}, {(~stays).sum()} photos found elsewhere",
+            poses,
+            scores,
+        )
+    return gauge(crops, poses), scores
 
 
 # ---------------------------------------------------------------- without hints
@@ -179,7 +230,7 @@ def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarra
 
 def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=None, nodes: int = 40):
     """Poses (P, 4, 4) and scores (P,) from one photo on: round i registers all photos and keeps the sizes[i] best for the next model."""
-    rings = crop_rings(crops) if rings is None else rings
+    rings = crop_rings(crops, PARTS) if rings is None else rings
     poses = np.array([pose_towards(c, np.array([0.0, 0.0, 1.0])) for c in crops])
     used, scores = [first], np.zeros(len(crops))
     anchor = poses[first]
@@ -192,12 +243,12 @@ def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=
         tolerance = 0.4 if len(used) < 5 else 0.2 if i < len(sizes) - 2 else 0.12
         model = coarse_model(some, poses[used], nodes, 60 if len(used) < 10 else 90, tolerance, seed + i, limit)
         render = volume_render(model)
-        gallery = make_gallery(render, views_from(directions_around(400, seed + i)))
+        gallery = make_gallery(render, views_from(directions_around(400, seed + i)), PARTS)
         seen = near(gallery, centres, 55).any(0)
         found = search(crops, gallery, 1, rings=rings, allowed=np.tile(seen, (len(crops), 1)))
         poses, scores = found.poses[:, 0], found.scores[:, 0]
         if i >= 4:
-            poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 4.0, 2.0))
+            poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 4.0, 2.0), parts=PARTS)
         poses = gauge(crops, poses)
         used = sorted(set(np.argsort(-scores)[:size].tolist()) | {first})
         say(f"grown from photo {first}: {len(used)} of {len(crops)} photos, mean score {scores[used].mean():.3f}", poses, scores)
@@ -205,25 +256,29 @@ def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=
     return poses, scores
 
 
-def find_poses(
-    crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, keep: int, starts: int, without, seed: int, say
-):
-    """Poses (P, 4, 4) and scores (P,), from hints where half of the photos have them, else by growth. without: names of
-    `collection.WITHOUT`."""
+def find_poses(crops, directions, degrees: float, schedule: Schedule, keep: int, starts: int, without, seed: int, say, cycles: int = 0):
+    """Poses (P, 4, 4) and scores (P,), from hints where half of the photos have them, else by growth. cycles: of `polish` after that.
+    without: names of `collection.WITHOUT`."""
     hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
     keep = 1 if "multiplex" in without else keep
     if "search" in without:
-        return np.array([pose_towards(c, d if d.any() else [0, 0, 1.0]) for c, d in zip(crops, directions, strict=True)]), np.ones(
-            len(crops)
-        )
+        front = np.array([0.0, 0.0, 1.0])
+        poses = [pose_towards(c, d if d.any() else front) for c, d in zip(crops, directions, strict=True)]
+        return np.array(poses), np.ones(len(crops))
+
+    def tell(text, *_):
+        say(text)
+
     if hinted >= 0.5:
-        return poses_from_hints(crops, directions, degrees, schedule, seed, lambda text, *_: say(text), keep)
-    return poses_by_growth(crops, starts, keep, seed, lambda text, *_: say(text))
+        poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep)
+    else:
+        poses, scores = poses_by_growth(crops, starts, keep, seed, tell)
+    return polish(crops, poses, directions, degrees, keep, seed, tell, cycles) if cycles > 0 else (poses, scores)
 
 
 def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
     """Grow from several photos for a few rounds, go on with the one that agrees best, and settle with all photos."""
-    rings, count = crop_rings(crops), len(crops)
+    rings, count = crop_rings(crops, PARTS), len(crops)
     first = start_photos(crops, rings, starts)
     early = sorted({min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2)})
     tried = []
@@ -257,7 +312,7 @@ def settle(crops: list[Crop], poses: np.ndarray, rings, keep: int, seed: int, sa
     for i in range(rounds):
         model = coarse_model(crops, gauge(crops, poses), 48, 120, 0.12, seed + 100 + i)
         render = volume_render(model)
-        gallery = make_gallery(render, views_from(directions_around(500, seed + 100 + i)))
+        gallery = make_gallery(render, views_from(directions_around(500, seed + 100 + i)), PARTS)
         found = search(crops, gallery, keep, rings=rings)
         poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1)
         say(f"settling, round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
