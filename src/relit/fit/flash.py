@@ -42,7 +42,7 @@ LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
 PLACE = 0.15  # how much a unit length counts beside a display value when places are compared
-START_ALBEDO, MEAN_COSINE = 0.4, 0.7
+START_ALBEDO, MEAN_COSINE, START_WIDTH = 0.4, 0.7, 0.2
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,9 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, satur
         diffuse[known] = np.where(found.seen[:, None], found.albedo, diffuse[known])
         scale = BRIGHTEST / max(float(np.percentile(diffuse[known].max(1), 99)), 1e-6)
         specular = np.clip(spread(parts["albedo"][:, 3:])[..., 0] * scale, 0.05, MOST_SPECULAR)
-        field = start_plastic(np.clip(fill_gutters(diffuse, known) * scale, 0, 1), specular, spread(parts["alpha"][:, None])[..., 0])
+        specular = np.full_like(specular, np.median(specular[known]))  # one lobe all over: that of the volume pass is coarse
+        alpha = np.full_like(specular, START_WIDTH)
+        field = start_plastic(np.clip(fill_gutters(diffuse, known) * scale, 0, 1), specular, alpha)
         features = np.zeros((*known.shape, 4), np.float32)
         features[known] = found.features
         log_intensity = mi.Float([float(np.log(flash.intensity / scale))])
@@ -253,7 +255,7 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, satur
         kinship = None
         if "features" not in options.without:
             place = PLACE * spread(mesh.vertices)
-            lobe = np.stack([specular, spread(parts["alpha"][:, None])[..., 0]], -1)
+            lobe = np.stack([specular, alpha], -1)
             kinship = start_kinship(np.concatenate([features[..., :3], place], -1), known, lobe)
         model = FlashModel(field, mi.Float(features.ravel()), kinship, mi.Float(parts["offset"]), log_intensity, coat)
         fit_flash_surface(bank, cameras, traceable, model, o, stage, seed)

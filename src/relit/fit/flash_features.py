@@ -1,7 +1,8 @@
 """What a flash capture tells of each place of the surface before any fit of the material (PIR Sec. 3.5, without a network's features).
 
 Divided by the diffuse shading of the flash, every photo gives a shading-free colour of the place: too bright where a highlight or an
-inter-reflection lies, right elsewhere. Low in the distribution over photos is the diffuse albedo. Places of like colour are
+inter-reflection lies, right elsewhere. Low in its distribution over photos that look at the place from the side (a flash at the
+camera puts the highlight where one looks straight down) is the diffuse albedo. Places of like colour are
 likely of one material; the features hold the colour as it is displayed, and how bright the place gets at most above it.
 """
 
@@ -20,8 +21,8 @@ from relit.materials.rough_plastic import Coat
 from relit.rendering.transport import OFFSET, TraceableMesh
 from relit.scene import Camera
 
-LOW = 0.15  # quantile over photos that is taken for the diffuse part
-LEAST_COSINE = 0.25
+LOW = (0.15, 0.4)  # quantiles over photos that are taken for the diffuse part: of all photos, and of those from the side
+LEAST_COSINE, SIDE = 0.35, 0.82  # of the viewer's direction: photos below the first do not count, below the second are from the side
 ALPHA = 0.2  # of the coat that the diffuse light passes
 
 
@@ -47,22 +48,29 @@ def capture_features(
 ) -> Found:
     """The features of N surface points x with normals n, both (N, 3), unit frame."""
     values = np.full((bank.views, len(x), 3), np.nan, np.float16)
+    aside = np.zeros((bank.views, len(x)), bool)
     n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
     dr.eval(point, normal)
     with dr.suspend_grad():
         for view, camera in enumerate(cameras):
-            values[view] = shading_free(bank, camera, view, mesh, point, normal, coat, flash)
-    seen = np.isfinite(values[..., 0]).sum(0) >= 3
+            values[view], cosine = shading_free(bank, camera, view, mesh, point, normal, coat, flash)
+            aside[view] = np.isfinite(values[view, :, 0]) & (cosine < SIDE)
+    seen, enough = np.isfinite(values[..., 0]).sum(0) >= 3, aside.sum(0) >= 4
     albedo = np.full((len(x), 3), 0.5, np.float32)
-    for part in np.array_split(np.flatnonzero(seen), max(1, len(x) // 20_000)):
-        albedo[part] = np.nanquantile(values[:, part].astype(np.float32), LOW, axis=0)
+    for quantile, which in zip(LOW, (seen & ~enough, enough), strict=True):
+        for part in np.array_split(np.flatnonzero(which), max(1, len(x) // 20_000)):
+            v = values[:, part].astype(np.float32)
+            if which is enough:
+                v[~aside[:, part]] = np.nan
+            albedo[part] = np.nanquantile(v, quantile, axis=0) if len(part) else 0
     shown = srgb_from_linear(np.clip(albedo, 0, 1.5))
     return Found(albedo, seen, np.concatenate([shown, np.zeros((len(x), 1))], 1).astype(np.float32))
 
 
-def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, coat: Coat, flash: FlashView) -> np.ndarray:
-    """(N, 3): the photo's value at the points over what a white diffuse base would show there; NaN where the photo does not show them."""
+def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, coat: Coat, flash: FlashView):
+    """The photo's value at the points over what a white diffuse base would show there, (N, 3), NaN where the photo does not show them;
+    and the cosine of the viewer's direction (N,)."""
     number = dr.opaque(mi.UInt32, view)
     eye = light_position(bank.cameras, number, mi.Vector3f(0))
     light = light_position(bank.cameras, number, mi.Vector3f(*[float(v) for v in flash.offset]))
@@ -91,4 +99,4 @@ def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh
     )
     out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * inverse * flash.intensity, 1e-6)
     out = dr.select(ok, out, dr.nan)
-    return np.array(out).T
+    return np.array(out).T, np.array(cos_v)

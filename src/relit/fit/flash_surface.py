@@ -22,7 +22,7 @@ from relit.fit.pixels import PixelBank, batch_of, draw_pixels
 from relit.fit.surface import neighbours
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import PlasticField, plastic_at, project
-from relit.materials.rough_plastic import Coat
+from relit.materials.rough_plastic import Coat, Plastic
 from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits
 from relit.rendering.transport_flash import direct, indirect, lit
 
@@ -46,7 +46,7 @@ class FlashSurfaceOptions:
     directions: int = 1
     bounces: int = 2
     shadow: bool = True
-    colour_rate: float = 0.01
+    colour_rate: float = 0.004
     specular_rate: float = 0.004
     alpha_rate: float = 0.002
     offset_rate: float = 0.002
@@ -90,6 +90,7 @@ def fit_flash_surface(
     """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when there is one."""
     field, o = model.field, options
     even = calm_weights(bank, cameras, o.edge)
+    beginning = PlasticField(field.size, mi.Float(field.diffuse), field.lobe, field.slope)
     first = 0
     saved = stage.load("checkpoint")
     if saved:
@@ -141,7 +142,8 @@ def fit_flash_surface(
         gradients = {name: dr.grad(p) for name, p in params.items()}
         dr.disable_grad(*params.values())
         dr.eval(gradients, fit)
-        field.diffuse = adam["diffuse"].step(dr.detach(field.diffuse), gradients["diffuse"], o.colour_rate * decay)
+        colour_rate = o.colour_rate * decay * min(1.0, 10 * i / o.steps)  # the lobes settle first
+        field.diffuse = adam["diffuse"].step(dr.detach(field.diffuse), gradients["diffuse"], colour_rate)
         field.lobe = adam["lobe"].step(dr.detach(field.lobe), gradients["lobe"], o.alpha_rate * decay, ratio)
         slope_rate = o.slope_rate * decay * (i >= o.slope_begin * o.steps)
         field.slope = adam["slope"].step(dr.detach(field.slope), gradients["slope"], slope_rate)
@@ -154,7 +156,7 @@ def fit_flash_surface(
                 keep = dr.opaque(mi.Float, 1 - (1 - o.own) * decay)
                 common = model.kinship.spread(model.kinship.level)
                 field.lobe = common + keep * (field.lobe - common)
-                if i % o.share_every == 0:
+                if i % (o.share_every if 20 * i > o.steps else 2) == 0:
                     share(i, points, batch, plastic, n, position, intensity, seen, (a + b) * 0.5 - straight, calm, sigma, decay)
         project(field)
         dr.eval(model.offset, model.log_intensity, field.diffuse, field.lobe, field.slope)
@@ -167,6 +169,8 @@ def fit_flash_surface(
         weight = display_weight(batch.rgb) * dr.select(points.valid, calm * robust_weight(now - photo, batch.rgb, sigma), 0)
         dr.eval(n, position, intensity, photo, weight, plastic)
         shade = lambda p: direct(points, p, model.coat, n, position, intensity, seen)  # noqa: E731
+        told, _ = plastic_at(beginning, points.uv, points.valid)
+        plastic = Plastic(told.diffuse, plastic.specular, plastic.alpha)
         share_evidence(model.kinship, field, points.uv, plastic, shade, photo, weight, o.share * decay)
 
     def state() -> dict:

@@ -7,7 +7,8 @@ nothing supports it. The groups gather the evidence of all their texels: what is
 A broad strong lobe over a dark base looks much like a narrow weak one over a brighter base but for its very peak, and steps along gradients
 stop in between, the diffuse albedo of every texel having settled on what the wrong lobe leaves over. So the groups' numbers are searched
 for: for each width of the lobe on a ladder, the specular albedo and a factor and a grey shift of the diffuse albedo are a linear
-least-squares problem; the width with the least error is taken, and the diffuse albedos move with it.
+least-squares problem; the width with the least error is taken. The diffuse albedo is here the one that the capture tells before
+any fit: the noise of a texture in the middle of its fit would weaken its column, and a broad lobe would take its place.
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ PRIOR = (1e-3, 1e-2, 3e-3)  # belief in no change of specular albedo, factor and
 @dataclass
 class Kinship:
     """groups: their number. index: UInt32 [texels * NEAREST]. weight: Float [texels * NEAREST], summing to 1 for each texel. level: Float
-    [groups * 2], specular albedo and alpha of each group. sums: (LADDER, groups, COLUMNS, COLUMNS), running weighted sums
-    of products of `share_evidence`'s columns."""
+    [groups * 2], specular albedo and alpha of each group. alike: (groups, groups), how far one's evidence counts for another.
+    sums: (LADDER, groups, COLUMNS, COLUMNS), running weighted sums of products of `share_evidence`'s columns."""
 
     groups: int
     index: Any
     weight: Any
     level: Any
+    alike: np.ndarray
     sums: np.ndarray
 
     def spread(self, values, channels: int = 2):
@@ -75,15 +77,16 @@ def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, gro
         mi.UInt32(index.astype(np.uint32).ravel()),
         numbers(weight),
         numbers(level),
+        np.exp(-np.square(centres[:, None] - centres[None]).sum(-1) / (2 * (width / 2) ** 2)),
         np.zeros((len(LADDER), groups, COLUMNS, COLUMNS)),
     )
 
 
 def share_evidence(kin: Kinship, field: PlasticField, uv, plastic: Plastic, shade: Callable, photo, weight, rate: float) -> None:
-    """Move all groups by `rate` of the way to their best numbers, in the levels and in the textures.
+    """Move all groups by `rate` of the way to their best numbers, in the levels and in the texture.
 
-    plastic: at the points. shade: Plastic -> radiance (Color3f) at the points, linear in the albedos. photo: Color3f, what direct light
-    should show. weight: Color3f of squared differences.
+    plastic: at the points, its diffuse albedo as the capture tells it. shade: Plastic -> radiance (Color3f) at the points, linear in the
+    albedos. photo: Color3f, what direct light should show. weight: Color3f of squared differences.
     """
     s = field.size
     texel = mi.UInt32(dr.clip(uv.y * s, 0, s - 1)) * s + mi.UInt32(dr.clip(uv.x * s, 0, s - 1))
@@ -106,15 +109,11 @@ def share_evidence(kin: Kinship, field: PlasticField, uv, plastic: Plastic, shad
     keep = FORGET if kin.sums.any() else 0.0
     kin.sums = keep * kin.sums + (1 - keep) * now
     level = np.array(kin.level).reshape(-1, 2)
-    best = best_lobes(kin.sums, level)
+    best = best_lobes(np.einsum("gh,lhij->lgij", kin.alike, kin.sums), level)
     change = mi.Float((rate * (best[:, :2] - level)).astype(np.float32).ravel())
     kin.level = kin.level + change
     field.lobe = field.lobe + kin.spread(change)
-    both = kin.spread(mi.Float((rate * (best[:, 2:] - [1, 0])).astype(np.float32).ravel()))
-    k = dr.arange(mi.UInt32, dr.width(field.diffuse))
-    factor, shift = dr.gather(mi.Float, both, k // 4 * 2), dr.gather(mi.Float, both, k // 4 * 2 + 1)
-    field.diffuse = dr.maximum(field.diffuse * (1 + factor) + shift, 0)
-    dr.eval(kin.level, field.lobe, field.diffuse)
+    dr.eval(kin.level, field.lobe)
 
 
 def best_lobes(sums: np.ndarray, level: np.ndarray) -> np.ndarray:
