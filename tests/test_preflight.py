@@ -15,7 +15,7 @@ from relit.conventions import srgb_from_linear, world_from_gl_camera
 from relit.preflight import inspect
 from relit.preflight.cameras import fundamental, match, widest_gap
 from relit.preflight.drift import drift
-from relit.preflight.light import light_regime, shading_fits
+from relit.preflight.light import LIMB, light_regime, limb_slopes, shading_fits
 from relit.preflight.look import Exif, look_at_photos, read_exif, sharpness
 from relit.scene import Camera, Capture, Photo, Pixels, Sphere
 
@@ -104,6 +104,16 @@ def test_shading_is_told_from_texture(tmp_path):
     spread, _, _, _ = shading_fits(look_at_photos(capture(tmp_path, [fixed] * 12)), BALL)
     assert spread < 0.2
     assert shading_fits(look_at_photos(capture(tmp_path, [fixed] * 2)), BALL) is None
+
+
+def test_a_lamp_at_the_camera_is_told_from_the_outline(tmp_path):
+    """Without cameras or dark surroundings: only under a flash does the object darken evenly towards its outline."""
+    slopes = limb_slopes(look_at_photos(capture(tmp_path, [flash] * 8, with_cameras=False)))
+    assert slopes.shape == (8, 3) and np.median(slopes[:, 2]) > LIMB and (np.abs(slopes[:, :2]).max(1) < slopes[:, 2]).all()
+    assert light_regime(capture(tmp_path, [flash] * 8, with_cameras=False))["guess"] == "flash"
+    slopes = limb_slopes(look_at_photos(capture(tmp_path, [fixed] * 8)))
+    assert np.median(slopes[:, 2]) < LIMB
+    assert len(limb_slopes(look_at_photos(capture(tmp_path, [fixed] * 8, mask=False)))) == 0
 
 
 def test_blur_exposure_and_tint_are_found(tmp_path):

@@ -19,6 +19,7 @@ SAME_PLACE = 0.45  # overlap of the surroundings' colours; .54 and .70 in one ro
 DARK = 0.02  # linear: surroundings of a flash photo
 CELLS = (24, 48)  # of the object sphere's directions
 SAMPLES = 1500  # pixels of a photo
+LIMB = 1.2  # log brightness per unit of an inflated mask's normal, towards the camera; 1.5 to 3 under a flash, below .6 elsewhere
 
 
 def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
@@ -42,6 +43,7 @@ def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
         votes["flash"] += 1.0 if share > 0.8 else 0.0
         votes["fixed"] += 0.3 if share < 0.2 else 0.0
     _surroundings(looks, votes, evidence)
+    _limb(looks, votes, evidence)
     if capture.sphere is not None and len([x for x in looks if x.camera is not None]) >= 4:
         _shading(looks, capture.sphere, votes, evidence)
     guess = max(votes, key=votes.get)
@@ -159,6 +161,39 @@ def _around(x: Look) -> np.ndarray:
     if x.mask is not None:
         border = x.mask < 0.05 if (x.mask < 0.05).mean() > 0.1 else border & (x.mask < 0.5)
     return np.median(x.rgb[border], axis=0) if border.any() else np.zeros(3)
+
+
+# ---------------------------------------------------------------- shading inside the masks
+
+
+def _limb(looks: list[Look], votes: dict, evidence: list[str]) -> None:
+    slopes = limb_slopes(looks)
+    if len(slopes) < 3:
+        return
+    sideways = np.hypot(slopes[:, 0], slopes[:, 1])
+    frontal = float((slopes[:, 2] > sideways).mean())
+    if np.median(slopes[:, 2]) > LIMB and frontal > 0.8:
+        evidence.append(f"in {100 * frontal:.0f} % of the photos the object darkens evenly towards its outline: lit from the camera")
+        votes["flash"] += 1.2
+
+
+def limb_slopes(looks: list[Look]) -> np.ndarray:
+    """(N, 3): how log brightness goes with the normal of the inflated mask (x right, y down, z to the camera), one row per photo with a
+    mask. A lamp at the camera leaves z alone; any other one has a side."""
+    found = []
+    for x in looks:
+        inside = None if x.mask is None else x.mask > 0.9
+        if inside is None or not 200 <= inside.sum() < 0.9 * inside.size:
+            continue
+        far = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+        height = cv2.GaussianBlur(np.sqrt(far * far.max()), (0, 0), max(1.5, 0.03 * float(np.sqrt(inside.sum()))))
+        down, right = np.gradient(height)
+        normal = np.stack([-right, -down, np.ones_like(height)], -1)[inside]
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        basis = np.concatenate([normal, np.ones((len(normal), 1))], 1)
+        slope, *_ = np.linalg.lstsq(basis, np.log(x.gray[inside] + 0.004), rcond=None)
+        found.append(slope[:3])
+    return np.array(found).reshape(-1, 3)
 
 
 # ---------------------------------------------------------------- shading of the object sphere
