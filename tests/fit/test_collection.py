@@ -10,6 +10,7 @@ mi = pytest.importorskip("mitsuba")
 TINY = [
     "side=48",
     "rounds=1",
+    "polish=0",
     "least_score=0.5",
     "keep=1",
     "levels=24",

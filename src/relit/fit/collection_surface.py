@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.fit.collection_options import CollectionOptions
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
@@ -32,6 +33,12 @@ class LightOptions:
     prior: float = 1e-3
     neutral: float = 1.0
     posterior: bool = True
+
+
+def light_options(options: CollectionOptions) -> LightOptions:
+    """Those of the recipe, or of an ablation."""
+    off = {"prior": 0.0, "neutral": 0.0} if "light_prior" in options.without else {}
+    return LightOptions(posterior="posterior" not in options.without, **off)
 
 
 @dataclass

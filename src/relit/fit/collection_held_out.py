@@ -1,0 +1,132 @@
+"""Photos that stand against a finished model: those that were set aside, and those whose place was not found at first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.cameras.se3 import rotation_angle
+from relit.fit.collection_options import CollectionOptions
+from relit.fit.collection_photos import Shot, crops_of
+from relit.fit.collection_poses import COARSE, GREY, PARTS, Quiet, best_refined
+from relit.fit.collection_surface import fit_collection_surface, light_options, start_collection_surface
+from relit.fit.multiview import run_arrays, vertex_areas
+from relit.fit.pixels import corrected, make_bank
+from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, refine, search, views_from, volume_render
+from relit.fit.surface import ALBEDO_START, SurfaceOptions
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.lighting.per_photo import COLUMNS, ROWS
+from relit.materials.field import start_material
+from relit.rendering.shade_photos import shade_photos, shade_plain, start_photo_lights
+from relit.rendering.transport import TraceableMesh
+from relit.scene import Camera
+
+AGAIN = 600  # viewpoints that a finished model is looked at from
+GAIN = 0.01  # by which another pose must score better than the present one
+
+
+def held_out_stage(held: list[Shot], model: VolumeModel, mesh, albedo, maps, cameras, degrees, run, options: CollectionOptions, seed: int):
+    """(cameras, lights (H, ROWS, COLUMNS, 3)) of the held-out photos: registered by rendering, descended, lit; model and material stay."""
+    if not held:
+        return [], np.zeros((0, ROWS, COLUMNS, 3), np.float32)
+    if run.done("held_out"):
+        kept = run_arrays(run, "held_out", "photos")
+    else:
+        with run.stage("held_out", steps=options.frozen_steps, title="photos that were set aside") as stage:
+            shots = [replace(s, camera=with_median_field(s, cameras)) for s in held]
+            found = register(shots, model, degrees, options, seed)
+            found = descend(shots, found, model, options, seed)
+            bank = make_bank(found, [s.rgb for s in shots], [s.mask for s in shots])
+            size = maps["roughness"].shape[0]
+            material = start_material(size, maps["base_color"], 0.5, 0.0)
+            material.colour = mi.Float(np.concatenate([maps["base_color"], maps["roughness"][..., None]], -1).astype(np.float32).ravel())
+            material.metallic = mi.Float(maps["metallic"].astype(np.float32).ravel())
+            n = maps["normal"]
+            material.slope = mi.Float((n[..., :2] / np.maximum(n[..., 2:], 0.1)).astype(np.float32).ravel())
+            lit = start_collection_surface(material, np.array([s.tint for s in shots]), ALBEDO_START)
+            areas = vertex_areas(mesh)
+            scale = ALBEDO_START / float((albedo * areas[:, None]).sum() / areas.sum() / 3)
+            o = SurfaceOptions(options.frozen_steps, options.points, options.directions, size)
+            fit_collection_surface(bank, TraceableMesh(mesh, albedo * scale), lit, o, light_options(options), stage, seed, frozen=True)
+            kept = {
+                "poses": np.array([c.world_from_camera for c in found]),
+                "focal": np.array([c.fx for c in found]),
+                "lights": np.exp(lit.lights()).reshape(-1, ROWS, COLUMNS, 3),
+            }
+            stage.save("photos", **kept)
+    found = [replace(s.camera, fx=f, fy=f, world_from_camera=p) for s, f, p in zip(held, kept["focal"], kept["poses"], strict=True)]
+    return found, kept["lights"]
+
+
+def with_median_field(shot: Shot, cameras: list[Camera]) -> Camera:
+    """A held-out photo without EXIF starts with the median focal length of the others, in units of the longer side."""
+    if shot.photo.focal_hint is not None or shot.photo.camera is not None:
+        return shot.camera
+    focal = float(np.median([c.fx / max(c.width, c.height) for c in cameras])) * max(shot.camera.width, shot.camera.height)
+    return replace(shot.camera, fx=focal, fy=focal)
+
+
+def find(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int):
+    """(crops, their descriptors, what renders the model, hypotheses of every photo) by search from all around."""
+    crops, hints = crops_of(shots), np.array([s.direction for s in shots])
+    render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops, PARTS)
+    gallery = make_gallery(render, views_from(directions_around(AGAIN, seed)), PARTS)
+    prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * (np.linalg.norm(hints, axis=1) > 0.5)[:, None, None]
+    return crops, rings, render, search(crops, gallery, options.keep, rings=rings, prior=prior)
+
+
+def register(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int) -> list[Camera]:
+    """The cameras of photos that the model has not seen, by search and local refinement."""
+    crops, rings, render, found = find(shots, model, degrees, options, seed)
+    poses, _ = best_refined(crops, found, render, rings, options.keep)
+    return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)]
+
+
+def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int):
+    """(cameras, numbers of the photos that moved): every photo is searched for in the finished model, whose detail tells apart what the
+    coarse ones took for each other (a stool from above, half a turn away). Those that fit elsewhere by GAIN move there, and descend."""
+    shots = [replace(s, camera=c.with_pose(np.eye(4))) for s, c in zip(shots, cameras, strict=True)]
+    present = np.array([c.world_from_camera for c in cameras])
+    crops, rings, render, found = find(shots, model, degrees, options, seed)
+    away = np.array([[rotation_angle(p[:3, :3].T @ q[:3, :3]) > 20 for q in row] for p, row in zip(present, found.poses, strict=True)])
+    best = np.where(away, found.scores, -1).argmax(1)
+    rows = np.arange(len(shots))
+    _, height = refine(crops, present, render, rings=rings, steps=(0,), parts=PARTS)
+    tried = np.flatnonzero(away[rows, best] & (found.scores[rows, best] > height - 0.06))
+    if not len(tried):
+        return cameras, []
+    some = [crops[i] for i in tried]
+    other, score = refine(some, found.poses[tried, best[tried]], render, rings=crop_rings(some, PARTS), steps=COARSE, parts=PARTS)
+    moved = [(int(i), pose) for i, pose, s in zip(tried, other, score, strict=True) if s > height[i] + GAIN]
+    if not moved:
+        return cameras, []
+    out = list(cameras)
+    placed = descend([shots[i] for i, _ in moved], [cameras[i].with_pose(p) for i, p in moved], model, options, seed)
+    for (i, _), camera in zip(moved, placed, strict=True):
+        out[i] = camera
+    return out, [i for i, _ in moved]
+
+
+def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, options: CollectionOptions, seed: int) -> list[Camera]:
+    """The cameras after a descent with the shape frozen: pose, distance, focal length and small lights move."""
+    bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
+    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    learnt, rates = start_photo_lights(np.array([s.tint for s in shots]), GREY)
+    own = replace(model, reflections=learnt, rates=rates, appearance=shade_photos)
+    own.grid = replace(model.grid)
+    o = VolumeOptions(
+        (model.grid.n,),
+        (max(60, options.frozen_steps),),
+        options.rays // 2,
+        sdf_rate=0.0,
+        feature_rate=0.0,
+        diffusion=0.0,
+        eikonal=0.0,
+        sharpness=(2.0, 6.0),
+        refine_cameras=options.refine_cameras,
+    )
+    fit_volume(bank, own, o, Quiet(), seed)
+    return corrected(cameras, np.array(bank.corrections))

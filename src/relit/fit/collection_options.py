@@ -1,0 +1,85 @@
+"""Options of the `collection` recipe, and their values for each quality."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from relit.errors import UserError, did_you_mean
+
+WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "light_prior")
+
+
+@dataclass(frozen=True)
+class CollectionOptions:
+    """side: pixels of the photos' longer side. rounds: of coarse fit and registration. polish: turns of descent and search after them.
+    keep: hypotheses of each photo that are refined (SAMURAI's multiplex). hints: whether quadrants or angles are used. holdout: every so
+    many photos are set aside (0: none but those of held_out.json). starts: photos that growth begins from without hints. least_score: of
+    the registration, on average, below which the poses are taken for wrong. levels, level_steps, rays: of the volume pass.
+    refine_cameras: step of the camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass.
+    frozen_steps: of the fit of held-out photos. without: what an ablation switches off.
+    """
+
+    side: int = 400
+    rounds: int = 6
+    polish: int = 3
+    keep: int = 3
+    hints: bool = True
+    holdout: int = 0
+    starts: int = 4
+    least_score: float = 0.84
+    levels: tuple[int, ...] = (64, 128)
+    level_steps: tuple[int, ...] = (400, 500)
+    rays: int = 6144
+    refine_cameras: float = 0.003
+    faces: int = 30_000
+    texture: int = 512
+    surface_steps: int = 700
+    points: int = 4096
+    directions: int = 32
+    frozen_steps: int = 150
+    without: tuple[str, ...] = ()
+
+    @property
+    def max_pixels(self) -> int:
+        """Of all photos together, for the forecast of memory: each is shrunk as it is read."""
+        return 150 * self.side**2
+
+    def __post_init__(self):
+        for name in self.without:
+            if name not in WITHOUT:
+                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+
+
+PRESETS = {
+    "draft": {
+        "side": 200,
+        "keep": 2,
+        "starts": 2,
+        "levels": (48, 80),
+        "level_steps": (200, 250),
+        "rays": 4096,
+        "faces": 10_000,
+        "texture": 256,
+        "surface_steps": 250,
+        "points": 2048,
+        "frozen_steps": 80,
+    },
+    "standard": {},
+    "high": {
+        "side": 800,
+        "levels": (64, 128, 192),
+        "level_steps": (500, 600, 600),
+        "rays": 8192,
+        "faces": 60_000,
+        "texture": 1024,
+        "surface_steps": 2000,
+        "directions": 64,
+    },
+}
+
+
+def options_for(quality: str) -> CollectionOptions:
+    """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
+    if quality not in PRESETS:
+        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
+    return CollectionOptions(**PRESETS[quality])
