@@ -26,7 +26,8 @@ ROWS = [
 ]
 LEVEL = {name: i for i, row in enumerate(ROWS) for name in row}
 BUILT_UPON = ("asset", "relight", "edit", "evaluate", "viewer")  # read asset folders only: never import `fit`
-GROUND_TRUTH = {"asset", "rendering", "materials", "geometry"}  # what capture/synthetic*.py may import: they render the truth, so they alone reach up
+# what capture/synthetic*.py may import: they render the truth, so they alone reach up
+GROUND_TRUTH = {"asset", "rendering", "materials", "geometry"}
 USERS_OF_SYNTHETIC = {"benchmark", "demo", "cli", "verbs"}
 
 

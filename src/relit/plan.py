@@ -16,7 +16,7 @@ from relit.scene import Capture, Sphere
 from relit.settings import read_config, with_values
 
 KINDS = ("multiview", "flash", "duplicates", "collection")
-# The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture, run, options, seed) -> Asset.
+# The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture, run, options, seed) -> Asset,
 # and LIGHT (a phrase) and STAGES (names) for `relit inspect`. It may also hold FINDS_CAMERAS = True (photos without cameras come to it as
 # they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST (see MEASURED).
 RECIPES = {
@@ -107,9 +107,20 @@ def open_as(path: Path, job: Job) -> tuple[Capture, str]:
     return capture, capture_kind(capture.kind or "multiview") if asked == "auto" else asked
 
 
-# folders whose files decide as well
-BESIDE = ("sparse", "relit-corrections", "masks", "mask", "segmentations", "silhouettes", "normals", "normal", "cutouts", "cut-outs",
-"instances")
+# Folders whose files decide as well.
+BESIDE = (
+    "sparse",
+    "relit-corrections",
+    "masks",
+    "mask",
+    "segmentations",
+    "silhouettes",
+    "normals",
+    "normal",
+    "cutouts",
+    "cut-outs",
+    "instances",
+)
 
 
 def input_digests(capture: Capture) -> dict[str, str]:

@@ -23,6 +23,7 @@ from relit.viewer.page import PAGE
 ROOT = Path(__file__).resolve().parents[2]
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
 
+
 @pytest.fixture(scope="session")
 def asset() -> Asset:
     """The pawn, turned, scaled and moved in the world, under a lopsided light; three cameras."""

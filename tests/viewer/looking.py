@@ -11,6 +11,7 @@ from relit.conventions import environment_directions, srgb_from_linear
 WIDTH, HEIGHT = 96, 80
 READY = {"wait": "window.relit?.ready"}
 
+
 def lopsided(height=32):
     """(H, 2H, 3) radiance with a warm sun, a blue window and a gradient: no mirror or turn of it looks like itself."""
     d = environment_directions(height, 2 * height)

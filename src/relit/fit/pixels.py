@@ -111,8 +111,8 @@ def rays_through(cameras, view, x, y, corrections=None):
 
     A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by the translation, both in the unit frame.
     Where corrections have seven numbers a view, the camera turns about the ORIGIN of the unit frame (a viewpoint that is wrong is put right
-    without moving the picture), then moves, and the seventh is 1 / ZOOM of the logarithm of a factor on the focal lengths and on the distance from the
-    origin together (what stands there keeps its size in the picture; only the perspective changes).
+    without moving the picture), then moves, and the seventh is 1 / ZOOM of the logarithm of a factor on the focal lengths and on the
+    distance from the origin together (what stands there keeps its size in the picture; only the perspective changes).
     """
     k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y

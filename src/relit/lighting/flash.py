@@ -19,7 +19,8 @@ from relit.scene import Camera, Flash
 
 
 def light_position(cameras, view, offset):
-    """o + R Δo (Vector3f) for each ray's photo. cameras: Float [views * 16], rows of fit.pixels.camera_rows. view: UInt32. offset: Vector3f."""
+    """o + R Δo (Vector3f) for each ray's photo. cameras: Float [views * 16], rows of fit.pixels.camera_rows. view: UInt32. offset:
+    Vector3f."""
     r = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in (1, 2, 3)]
     return mi.Vector3f(*[k.x * offset.x + k.y * offset.y + k.z * offset.z + k.w for k in r])
 
@@ -60,5 +61,7 @@ def read_flash(path: str | Path) -> Flash:
             raise ValueError("offset and intensity must be three finite numbers each, intensity not negative")
     except (OSError, ValueError, KeyError, TypeError) as e:
         why = f"{type(e).__name__}: {e}"
-        raise UserError("the flash cannot be read", why, f'it should hold {{"offset": [x, y, z], "intensity": [r, g, b]}}: {path}') from None
+        raise UserError(
+            "the flash cannot be read", why, f'it should hold {{"offset": [x, y, z], "intensity": [r, g, b]}}: {path}'
+        ) from None
     return Flash(offset, intensity)

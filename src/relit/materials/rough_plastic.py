@@ -2,9 +2,9 @@
 
     f cos θ_l = k_s F D G / (4 cos θ_v)  +  k_d / (1 - R_int) / π  T(θ_v) T(θ_l) / η²  cos θ_l
 
-with the true dielectric Fresnel term F, Smith's separable G (Walter et al. 2007), and k_s, k_d the specular and the diffuse albedo. T(θ) = the
-share of light that enters the coat from outside, R_int = the mean share that it throws back from inside: both depend on alpha, are
-integrated here (`transmittance_tables`) and interpolated, so that roughness receives its gradient through them. PIR's released code
+with the true dielectric Fresnel term F, Smith's separable G (Walter et al. 2007), and k_s, k_d the specular and the diffuse albedo.
+T(θ) = the share of light that enters the coat from outside, R_int = the mean share that it throws back from inside: both depend on alpha,
+are integrated here (`transmittance_tables`) and interpolated, so that roughness receives its gradient through them. PIR's released code
 divides the specular part by the light's cosine and multiplies the diffuse one by the viewer's; here they stand in their right places.
 
 Directions point away from the surface: `v` to the viewer, `l` to the light, `n` the shading normal. All unit.
