@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from relit.capture import open_capture
-from relit.capture.samurai import read_hints
+from relit.capture.samurai import direction_of, quadrant_of, read_hints
 from relit.errors import UserError
 from relit.images import write_srgb
-from relit.viewer.quadrants import answers_of, ask_in_terminal, quadrant_server
+from relit.viewer.quadrants import answers_of, ask_in_terminal, guesses_of, keys_of, quadrant_server
 
 
 @pytest.fixture
@@ -38,6 +38,36 @@ def test_terminal(capture):
     assert np.allclose(hints.directions["2.png"], [0, 1, 0])
     ask_in_terminal(capture, lambda text: "d" if text.startswith("1.png (1 of 1)") else pytest.fail(text), said.append)  # only what is left
     assert len(json.loads(path.read_text())["frames"]) == 3
+
+
+def test_directions_and_answers_are_inverse():
+    for keys in ("a", "df", "wb", "dsf", "s"):
+        answers = answers_of(keys)
+        assert quadrant_of(direction_of(answers)) == answers and set(keys_of(answers)) == set(keys)
+    assert quadrant_of(np.array([0.1, 0.2, -5.0])) == ["Center", "Center", "Back"]
+
+
+def test_guesses_of_a_finished_run(capture, tmp_path):
+    from relit.asset.asset import cameras_to_json
+    from relit.cameras.se3 import look_at
+    from relit.scene import Camera
+
+    eyes = {"0.png": [-2.0, 0, 2], "1.png": [0, 3.0, 0.1], "2.png": [2.0, 0, -0.1]}
+    cameras = [(f"image/{n}", Camera(30, 20, 40.0, 40.0, 15.0, 10.0, look_at(np.array(e)))) for n, e in eyes.items()]
+    (tmp_path / "run" / "asset").mkdir(parents=True)
+    (tmp_path / "run" / "asset" / "cameras.json").write_text(json.dumps(cameras_to_json(cameras)))
+    (tmp_path / "run" / "asset" / "asset.json").write_text("{}")
+    guesses = guesses_of(tmp_path / "run")
+    assert guesses == {"0.png": ["Left", "Center", "Front"], "1.png": ["Center", "Above", "Center"], "2.png": ["Right", "Center", "Center"]}
+    typed = {"0.png": "", "1.png": "b", "2.png": "q"}  # Enter takes the guess
+    path = ask_in_terminal(capture, lambda text: typed[text.split()[0]], lambda _: None, guesses)
+    said = {f["image_name"]: f["quadrant"] for f in json.loads(path.read_text())["frames"]}
+    assert said == {"0.png": guesses["0.png"], "1.png": ["Center", "Center", "Back"]}
+    server = quadrant_server(capture, guesses=guesses)
+    try:
+        assert [p["guess"] for p in server.answers["quadrants"]()["photos"]] == list(guesses.values())
+    finally:
+        server.server_close()
 
 
 def test_page(capture):

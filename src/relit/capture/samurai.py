@@ -30,6 +30,10 @@ ANSWERS = {  # axis by axis, in the object's frame: +x right, +y up, +z to the f
 }
 
 
+AXES = (("Left", "Right"), ("Below", "Above"), ("Back", "Front"))  # the negative and the positive side of each
+CENTRE = 22.5  # degrees from the plane between two sides: so near a camera counts as neither
+
+
 @dataclass(frozen=True)
 class Hints:
     """Where photos were taken from, roughly. directions: name -> (3,) unit vector from the object to the camera. degrees: how far off it
@@ -130,6 +134,13 @@ def direction_of(answers: list, name: str = "", path: Path | str = "") -> np.nda
             f"say at least one side, or leave the photo out of the file: {path}",
         )
     return out / np.linalg.norm(out)
+
+
+def quadrant_of(direction: np.ndarray) -> list[str]:
+    """SAMURAI's three answers for a camera at `direction` (3,) from the object, in the object's frame: the inverse of `direction_of`."""
+    unit = np.asarray(direction) / np.linalg.norm(direction)
+    edge = np.sin(np.radians(CENTRE))
+    return ["Center" if abs(v) < edge else sides[int(v > 0)] for v, sides in zip(unit, AXES, strict=True)]
 
 
 def _angles(content: dict, path: Path, names: list[str]) -> Hints:

@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 
 from relit.cameras.se3 import exp_so3, look_at
+from relit.capture.samurai import quadrant_of
 from relit.capture.synthetic import (
     LOWEST,
     RADIUS,
@@ -116,7 +117,7 @@ def synthesize_collection(
     world_from_asset = object_frame(mesh)
     shots = plan_shots(views, test_views, resolution, len(lights), seed)
     _write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
-    frames = [{"image_name": f"{s.name}.jpg", "quadrant": quadrant(s.camera.centre)} for s in shots]
+    frames = [{"image_name": f"{s.name}.jpg", "quadrant": quadrant_of(s.camera.centre)} for s in shots]
     _write_json(out / "quadrants.json", {"frames": frames})
     test = [f"{s.name}.jpg" for s in shots if s.test]
     if test:
@@ -183,17 +184,6 @@ def plan_shots(views: int, test_views: int, resolution: int, lights: int, seed: 
         camera = Camera(w, h, focal, focal, w / 2, h / 2, pose)
         shots.append(Shot(f"{i:03d}", camera, int(rng.integers(lights)), float(rng.random()), float(rng.uniform(*LEVEL)), white, i in test))
     return shots
-
-
-def quadrant(direction: np.ndarray) -> list[str]:
-    """SAMURAI's answers for a camera at `direction` from the object: where it stands, seen from the object's front (+z), +y up.
-
-    An axis is 'Center' while the camera is within 22.5 degrees of the plane between its two sides.
-    """
-    x, y, z = np.asarray(direction) / np.linalg.norm(direction)
-    edge = np.sin(np.radians(22.5))
-    pick = lambda v, low, high: "Center" if abs(v) < edge else (high if v > 0 else low)  # noqa: E731
-    return [pick(x, "Left", "Right"), pick(y, "Below", "Above"), pick(z, "Back", "Front")]
 
 
 # ---------------------------------------------------------------- one photo

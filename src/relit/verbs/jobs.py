@@ -108,16 +108,18 @@ def do_reconstruct(args) -> None:
 def quadrants_flags(parser: Parser) -> None:
     path_in(parser, "input", "folder of the photos of a collection")
     parser.common.add_argument("--terminal", action="store_true", help="ask in the terminal instead of a page")
+    parser.common.add_argument("--guess", metavar="RUN", help="fill in what the cameras of a finished run say; Enter takes it")
     parser.more.add_argument("--port", type=int, default=0, help="of the page, on 127.0.0.1 (default: a free one)")
     parser.more.add_argument("--no-browser", action="store_true", help="print the page's address only")
 
 
 def do_quadrants(args) -> None:
     from relit.capture import open_capture
-    from relit.viewer.quadrants import ask_in_terminal, quadrant_server
+    from relit.viewer.quadrants import ask_in_terminal, guesses_of, quadrant_server
     from relit.viewer.serve import serve_until_stopped
 
     capture = open_capture(args.input, masks="none", min_photos=1)
+    guesses = guesses_of(args.guess) if args.guess else {}
     if args.terminal:
-        return print(ask_in_terminal(capture))
-    return serve_until_stopped(quadrant_server(capture, args.port), lambda text: print(text, flush=True), not args.no_browser)
+        return print(ask_in_terminal(capture, guesses=guesses))
+    return serve_until_stopped(quadrant_server(capture, args.port, guesses), lambda text: print(text, flush=True), not args.no_browser)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from urllib.parse import parse_qs
 
-from relit.capture.samurai import QUADRANTS, direction_of
+from relit.capture.samurai import QUADRANTS, direction_of, quadrant_of
 from relit.errors import UserError
 from relit.files import write_text
 from relit.images import encode_jpeg
@@ -39,6 +39,11 @@ def answers_of(keys: str) -> list[str]:
     return out
 
 
+def keys_of(answers: list[str]) -> str:
+    """The keys of three answers: the inverse of `answers_of`."""
+    return "".join(key for key, word in KEYS.items() if word in answers)
+
+
 def read_answers(root: Path) -> dict[str, list[str]]:
     """The answers that are there: name of the file -> three words. Empty where there are none, or none that can be read."""
     try:
@@ -55,18 +60,37 @@ def write_answers(root: Path, answers: dict[str, list[str]]) -> Path:
     return root / QUADRANTS
 
 
-def ask_in_terminal(capture: Capture, ask: Callable[[str], str] = input, say: Callable[[str], None] = print) -> Path:
-    """Ask for every photo that has no answer yet; an empty line skips it, 'q' stops. Each answer is saved at once."""
-    root = _root(capture)
+def guesses_of(run: str | Path) -> dict[str, list[str]]:
+    """What a run's recovered cameras would answer: name of the file -> three words. Without hints a run's frame is that of the photo that
+    it grew from, taken for the front: then the guesses are right up to one turn of the whole. Raises UserError."""
+    from relit.asset.asset import find_asset, read_cameras
+
+    cameras = read_cameras(find_asset(run) / "cameras.json")
+    return {Path(name).name: quadrant_of(camera.centre) for name, camera in cameras}
+
+
+def ask_in_terminal(
+    capture: Capture,
+    ask: Callable[[str], str] = input,
+    say: Callable[[str], None] = print,
+    guesses: Mapping[str, list[str]] | None = None,
+) -> Path:
+    """Ask for every photo that has no answer yet; an empty line takes the guess, or skips the photo where there is none; 'q' stops. Each
+    answer is saved at once."""
+    root, guesses = _root(capture), guesses or {}
     answers = read_answers(root)
     say(EXPLAINED)
     todo = [p.name for p in (*capture.photos, *capture.held_out) if Path(p.name).name not in answers]
     for i, name in enumerate(todo):
+        guess = guesses.get(Path(name).name)
+        offer = "" if guess is None else f" [{' '.join(guess)}]"
         while True:
             try:
-                typed = ask(f"{name} ({i + 1} of {len(todo)}): ").strip()
+                typed = ask(f"{name} ({i + 1} of {len(todo)}){offer}: ").strip()
             except EOFError:
                 typed = "q"
+            if typed == "" and guess is not None:
+                typed = keys_of(guess)
             if typed in ("", "q"):
                 break
             try:
@@ -81,13 +105,15 @@ def ask_in_terminal(capture: Capture, ask: Callable[[str], str] = input, say: Ca
     return write_answers(root, answers)
 
 
-def quadrant_server(capture: Capture, port: int = 0) -> Server:
-    """A server of the page; every answer is saved at once."""
-    photos, root = (*capture.photos, *capture.held_out), _root(capture)
+def quadrant_server(capture: Capture, port: int = 0, guesses: Mapping[str, list[str]] | None = None) -> Server:
+    """A server of the page; every answer is saved at once. guesses: shown as chosen, until Enter makes them answers."""
+    photos, root, guesses = (*capture.photos, *capture.held_out), _root(capture), guesses or {}
 
     def state() -> dict:
         answers = read_answers(root)
-        return {"photos": [{"name": p.name, "answer": answers.get(Path(p.name).name)} for p in photos], "explained": EXPLAINED}
+        names = [(p.name, Path(p.name).name) for p in photos]
+        listed = [{"name": shown, "answer": answers.get(file), "guess": guesses.get(file)} for shown, file in names]
+        return {"photos": listed, "explained": EXPLAINED}
 
     def photo(query: str) -> tuple[bytes, str]:
         i = int(parse_qs(query)["i"][0])
@@ -145,10 +171,11 @@ function draw() {
 function show(i) {
   at = Math.max(0, Math.min(photos.length - 1, i));
   const p = photos[at];
-  chosen = new Set(Object.keys(keys).filter(k => (p.answer || []).includes(keys[k])));
+  chosen = new Set(Object.keys(keys).filter(k => (p.answer || p.guess || []).includes(keys[k])));
   $("photo").src = "photo.jpg?i=" + at;
   const done = photos.filter(q => q.answer).length;
-  $("what").textContent = p.name + " (" + (at + 1) + " of " + photos.length + ", " + done + " answered): where did the camera stand?";
+  const hint = !p.answer && p.guess ? " (a guess is shown)" : "";
+  $("what").textContent = p.name + " (" + (at + 1) + " of " + photos.length + ", " + done + " answered): where did the camera stand?" + hint;
   draw();
 }
 async function save() {
