@@ -174,8 +174,8 @@ function show(i) {
   chosen = new Set(Object.keys(keys).filter(k => (p.answer || p.guess || []).includes(keys[k])));
   $("photo").src = "photo.jpg?i=" + at;
   const done = photos.filter(q => q.answer).length;
-  const hint = !p.answer && p.guess ? " (a guess is shown)" : "";
-  $("what").textContent = p.name + " (" + (at + 1) + " of " + photos.length + ", " + done + " answered): where did the camera stand?" + hint;
+  const where = (at + 1) + " of " + photos.length + ", " + done + " answered", hint = !p.answer && p.guess ? " (a guess is shown)" : "";
+  $("what").textContent = p.name + " (" + where + "): where did the camera stand?" + hint;
   draw();
 }
 async function save() {
