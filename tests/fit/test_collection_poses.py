@@ -1,0 +1,82 @@
+"""Where photos were taken from: hints, descent, and the second look of a finished model."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from volume_lump import errors, photos_of, volume_lump
+
+from relit.cameras.se3 import exp_so3
+
+pytest.importorskip("mitsuba")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return volume_lump()
+
+
+@pytest.fixture(scope="module")
+def photos(model):
+    return photos_of(model, 14, np.random.default_rng(4))
+
+
+def direction(camera):
+    return camera.centre / np.linalg.norm(camera.centre)
+
+
+def off(photos, degrees, seed=0):
+    """Directions of the photos, wrong by about so many degrees."""
+    rng = np.random.default_rng(seed)
+    return np.array([exp_so3(np.radians(degrees) * rng.normal(size=3) / np.sqrt(3)) @ direction(c) for *_, c in photos])
+
+
+def after_alignment(poses, photos):
+    from relit.cameras.se3 import camera_errors
+
+    return camera_errors(poses, np.array([c.world_from_camera for *_, c in photos]))[0]
+
+
+def test_a_rough_start_descends(photos):
+    from relit.fit.collection_poses import descended, even_colours
+    from relit.fit.register import crop_photo
+
+    crops = even_colours([crop_photo(*p) for p in photos])
+    rng = np.random.default_rng(2)
+    start = np.array([c.world_from_camera for *_, c in photos])
+    for pose in start:
+        pose[:3] = exp_so3(rng.normal(size=3) * np.radians(5)) @ pose[:3]
+    before = after_alignment(start, photos)
+    model, poses = descended(crops, start, 32, 60, 0)
+    assert np.median(after_alignment(poses, photos)) < 0.6 * np.median(before)
+    assert model.grid.n == 32
+
+
+def test_only_the_lost_photo_moves(model, photos):
+    from relit.fit.collection_held_out import look_again
+    from relit.fit.collection_options import CollectionOptions
+    from relit.fit.collection_photos import Shot
+
+    some = photos[:4]
+    plain = [replace(c, world_from_camera=np.eye(4)) for *_, c in some]
+    shots = [
+        Shot(SimpleNamespace(name=str(i)), rgb, mask, p, np.zeros(3)) for i, ((rgb, mask, _), p) in enumerate(zip(some, plain, strict=True))
+    ]
+    cameras = [c for *_, c in some]
+    cameras[2] = cameras[2].with_pose(cameras[0].world_from_camera)
+    options = CollectionOptions(keep=2, frozen_steps=20, rays=2048, refine_cameras=0.001)
+    found, moved = look_again(shots, cameras, model, 45.0, options, 0)
+    assert moved == [2]
+    assert errors(np.array([c.world_from_camera for c in found]), some).max() < 6.0
+
+
+def test_ablation_without_search_keeps_the_hints(photos):
+    from relit.fit.collection_poses import even_colours, find_poses, schedule_of
+    from relit.fit.register import crop_photo
+
+    crops = even_colours([crop_photo(*p) for p in photos])
+    hints = off(photos, 20)
+    poses, scores = find_poses(crops, hints, 45.0, schedule_of(2), 1, 1, ("search",), 0, lambda *_: None, 3)
+    eyes = poses[:, :3, 3] / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
+    assert (eyes * hints).sum(1).min() > 0.97 and (scores == 1).all()
