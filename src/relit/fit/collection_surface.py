@@ -66,7 +66,7 @@ def start_collection_surface(material: MaterialField, tints: np.ndarray, albedo:
 
 
 def posterior(losses: np.ndarray, history: list[float]) -> np.ndarray:
-    """clip(tanh((μ - L) / σ) + 1, 0, 1), μ and σ of the ring buffer. SAMURAI Sec. 3.4 prints max(tanh(.) + 1, 1), which cannot silence a
+    """clip(tanh((μ - L) / σ) + 1, 0, 1), μ and σ of the ring buffer. SAMURAI Sec. 3.1 prints max(tanh(.) + 1, 1), which cannot silence a
     bad photo; its code clips, and so does this."""
     if len(history) < 20:
         return np.ones(len(losses), np.float32)
