@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from relit.asset.colmap_text import write_colmap
 from relit.asset.gltf import read_asset_file, write_glb
 from relit.asset.instances import read_instances, write_instances
 from relit.conventions import world_from_cv_camera, world_from_gl_camera
@@ -141,6 +142,8 @@ def save_asset(folder: str | Path, asset: Asset) -> Path:
                 (new / "lights").mkdir()
                 write_linear(new / "lights" / "environment.exr", asset.environment)
                 write_linear(new / "lights" / "environment.hdr", asset.environment)
+            if asset.lights:  # a collection: its cameras are a result that other programs want
+                write_colmap(new / "colmap", asset.cameras)
             for i, light in enumerate(asset.lights):
                 (new / "lights").mkdir(exist_ok=True)
                 write_linear(new / "lights" / f"photo_{i:04d}.exr", light)
