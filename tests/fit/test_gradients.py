@@ -15,7 +15,7 @@ from relit.cameras.se3 import look_at
 from relit.conventions import environment_directions
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank
-from relit.fit.surface import SurfaceOptions, dual_loss, light_prior, material_prior, neighbours, slope_prior
+from relit.fit.surface import SurfaceOptions, dual_loss, light_prior, material_prior, neighbours, parsimony, slope_prior
 from relit.geometry.sdf import make_grid, node_positions
 from relit.lighting.environment import Environment
 from relit.materials.field import material_at, slope_at, start_material
@@ -168,6 +168,7 @@ class SurfaceScene:
         prior = material_prior(self.field, surface, self.near, self.valid, self.options, mi.Float(self.options.smooth_colour))
         bend = self.bend.x * self.points.t + self.bend.y * self.points.b
         prior += slope_prior(self.field, bend, self.close, self.valid, self.options)
+        prior += parsimony(self.field, surface, self.points.uv, self.valid, mi.UInt32(7), self.options)
         return fit + prior + light_prior(x["log_light"], self.options)
 
 
@@ -217,3 +218,19 @@ def test_gradient_agrees_with_finite_differences(scenes, name, where):
 
 def test_the_list_is_complete(scenes):
     assert {name for scene, _ in scenes.values() for name in scene.start} == set(PARAMETERS)
+
+
+def test_darkening_everything_is_little_reward(scenes):
+    """Base colours half as bright cost sqrt(1/2) of what they did, not half: the priors must not darken the object."""
+    scene, _ = scenes["surface"]
+    scene.place({k: mi.Float(v) for k, v in scene.start.items()})
+    half = scene.start["colour"].reshape(-1, 4) * np.float32([0.5, 0.5, 0.5, 1])
+    alone = replace(scene.options, smooth_roughness=0.0, smooth_metallic=0.0, metallic_binary=0.0, metallic_sparse=0.0, bright=0.0)
+    wide = replace(alone, similarity_width=100.0)
+
+    def smoothness(colour):
+        scene.field.colour = mi.Float(colour.ravel())
+        surface = material_at(scene.field, scene.points.uv, scene.points.valid)
+        return float(material_prior(scene.field, surface, scene.near, scene.valid, wide, mi.Float(1.0))[0])
+
+    assert smoothness(half) == pytest.approx(0.5**0.5 * smoothness(half * np.float32([2, 2, 2, 1])), rel=1e-3) and smoothness(half) > 0

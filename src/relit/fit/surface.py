@@ -34,11 +34,11 @@ class SurfaceOptions:
     exchange_rate: of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of the steps over
     which colour_rate rises from a twentieth. roughness_start: first roughness. smooth_roughness, smooth_metallic, smooth_colour:
     weights of differences between similar neighbours, up to similarity_reach (unit frame) apart and similarity_width in base colour;
-    smooth_shade: power of `brightness` in smooth_colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. bright: of base colour beyond WHITE, squared. light_smooth: total
-    variation of the log radiance. light_neutral: its chroma. parsimony, parsimony_width, parsimony_share: see `parsimony`. slope_rate,
-    slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth: weights of `slope_prior`,
-    whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise does not move it at
-    full rate.
+    smooth_shade: power of `brightness` in smooth_colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. bright: of base
+    colour beyond WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma. parsimony,
+    parsimony_width, parsimony_share: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which
+    it moves. slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its
+    optimiser (see `Adam`), so that noise does not move it at full rate.
     """
 
     steps: int = 700
@@ -47,13 +47,13 @@ class SurfaceOptions:
     texture: int = 512
     light: int = 64
     colour_rate: float = 0.01
-    roughness_rate: float = 0.03
+    roughness_rate: float = 0.015
     metallic_rate: float = 0.01
     light_rate: float = 0.05
     exchange_rate: float = 0.02
     exchange_rows: int = 4
     warm: float = 0.3
-    roughness_start: float = 0.4
+    roughness_start: float = 0.3
     smooth_roughness: float = 0.1
     smooth_metallic: float = 0.1
     smooth_colour: float = 0.2
@@ -214,14 +214,25 @@ def brightness(rgb, base, valid, power: float):
     return dr.minimum(arriving / dr.maximum(mean, 1e-6), 2) ** power
 
 
+def common_scale(surface, valid):
+    """Factor on the base colours of the valid points in priors: (ALBEDO_START / their mean) ** 0.5, Float of width 1, with its gradient.
+
+    Differences themselves shrink when everything darkens, and the light would brighten without end; relative differences shrink when a
+    grey veil is laid over everything, and the light would dim. In between, as differences of display values do, they pull neither way.
+    """
+    return dr.sqrt(ALBEDO_START / dr.maximum(weighted_mean(mi.luminance(surface.base), dr.select(valid, mi.Float(1), 0)), 1e-3))
+
+
 def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing):
     """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour should share
     roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float)."""
     other = material_at(material, near.uv, near.valid)
-    difference = dr.detach(other.base - surface.base)
+    level = common_scale(surface, valid)
+    step = (other.base - surface.base) * level
+    difference = dr.detach(step)
     alike = dr.exp(-dr.squared_norm(mi.Vector3f(difference)) / (2 * options.similarity_width**2))
     w = dr.select(valid & near.valid, alike, 0)
-    change = dr.abs(other.base - surface.base)
+    change = dr.abs(step)
     smooth = (
         options.smooth_roughness * dr.abs(other.roughness - surface.roughness)
         + options.smooth_metallic * dr.abs(other.metallic - surface.metallic)
@@ -239,9 +250,10 @@ def parsimony(material: MaterialField, surface, uv, valid, shift, options: Surfa
     the partner of a point is in the batch."""
     n = dr.width(uv)
     partner = (dr.arange(mi.UInt32, n) + shift) % n
+    level = common_scale(surface, valid)
     uv, valid = dr.gather(mi.Point2f, uv, partner), valid & dr.gather(mi.Bool, valid, partner)
     other = material_at(material, uv, valid)
-    shown = lambda c: dr.maximum(c, 1e-3) ** (1 / 2.2)  # noqa: E731
+    shown = lambda c: dr.maximum(c * level, 1e-3) ** (1 / 2.2)  # noqa: E731
     alike = dr.exp(-dr.squared_norm(mi.Vector3f(shown(other.base) - shown(surface.base))) / (2 * options.parsimony_width**2))
     share = dr.abs(other.roughness - surface.roughness) + dr.abs(other.metallic - surface.metallic)
     value = options.parsimony_share * dr.detach(alike) * share - options.parsimony * alike
