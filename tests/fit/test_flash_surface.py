@@ -131,7 +131,7 @@ def test_fixed_offset_stays(shot):
 
 
 def test_shadow_is_cast_by_the_ball_itself(shot):
-    bank, views, mesh, _ = shot
+    bank, _, mesh, _ = shot
     batch = batch_of(bank, dr.arange(mi.UInt32, bank.total))
     points = first_hits(mesh, batch.o, batch.d)
     dr.eval(points)

@@ -20,7 +20,8 @@ import numpy as np
 
 from relit.conventions import move_points, similarity
 from relit.errors import UserError, did_you_mean
-from relit.fit.flash_features import FlashView, capture_features
+from relit.fit.flash_dino import DinoNetwork, network_file
+from relit.fit.flash_features import FlashView, capture_features, network_features
 from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
 from relit.fit.kinship import start_kinship
 from relit.fit.multiview import load_pixels, rotation_from_y, run_arrays, score_held_out
@@ -51,7 +52,8 @@ class FlashOptions:
     shrunk until all together have no more. shadows: soft visibility in the last level of the volume pass.
     faces: of the mesh, about. texture: texels a side. surface_steps, points: steps of the surface pass, pixels per step.
     directions: of inter-reflection per pixel and estimate. bounces: of it. ior: index of refraction of the coat.
-    smooth: weight of the material's smoothness. without: parts that are switched off, names of WITHOUT.
+    smooth: weight of the material's smoothness. dino: an ONNX file of a DINO network whose features tell which places are alike, or
+    `hub:OWNER/NAME/PATH` to fetch it; what the capture itself tells where empty. without: parts that are switched off, names of WITHOUT.
     """
 
     levels: tuple[int, ...] = (96, 192)
@@ -67,6 +69,7 @@ class FlashOptions:
     bounces: int = 2
     ior: float = IOR
     smooth: float = 0.0003
+    dino: str = ""
     without: tuple[str, ...] = ()
 
     def __post_init__(self):
@@ -125,6 +128,8 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     bank, cameras, masks, level = load_pixels(capture, options, run)
     check_photos(bank, cameras, masks, level)
     coat = Coat(options.ior)
+    if options.dino and not run.done("surface"):
+        DinoNetwork(network_file(options.dino))  # what is wrong with it is told before anything is computed
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
     else:
@@ -230,6 +235,7 @@ def mesh_stage(model: VolumeModel, run, options: FlashOptions) -> dict[str, np.n
 def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, saturated: float, run, options: FlashOptions, seed: int):
     """Material and flash. Returns (and keeps) diffuse, specular, alpha, normal, offset and intensity (unit frame)."""
     o = surface_options(options, saturated)
+    network = DinoNetwork(network_file(options.dino)) if options.dino else None
     with run.stage("surface", steps=o.steps, title="material and flash (surface pass)") as stage:
         face, bary = rasterise_atlas(mesh, options.texture)
         known = face >= 0
@@ -250,13 +256,15 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, satur
         field = start_plastic(np.clip(fill_gutters(diffuse, known) * scale, 0, 1), specular, alpha)
         features = np.zeros((*known.shape, 4), np.float32)
         features[known] = found.features
+        if network is not None:
+            features[known] = network_features(bank, cameras, traceable, texels["x"], texels["n"], flash, network)
         log_intensity = mi.Float([float(np.log(flash.intensity / scale))])
         features = fill_gutters(features, known)
         kinship = None
         if "features" not in options.without:
             place = PLACE * spread(mesh.vertices)
             lobe = np.stack([specular, alpha], -1)
-            kinship = start_kinship(np.concatenate([features[..., :3], place], -1), known, lobe)
+            kinship = start_kinship(np.concatenate([features, place], -1), known, lobe)
         model = FlashModel(field, mi.Float(features.ravel()), kinship, mi.Float(parts["offset"]), log_intensity, coat)
         fit_flash_surface(bank, cameras, traceable, model, o, stage, seed)
         maps = {name: fill_gutters(picture, known) for name, picture in plastic_pictures(model.field).items()}

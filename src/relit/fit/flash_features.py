@@ -9,12 +9,14 @@ likely of one material; the features hold the colour as it is displayed, and how
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from relit.conventions import srgb_from_linear
+from relit.fit.flash_dino import DinoNetwork, dino_features
 from relit.fit.pixels import PixelBank
 from relit.lighting.flash import incident, light_position
 from relit.materials.rough_plastic import Coat
@@ -68,35 +70,76 @@ def capture_features(
     return Found(albedo, seen, np.concatenate([shown, np.zeros((len(x), 1))], 1).astype(np.float32))
 
 
-def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, coat: Coat, flash: FlashView):
-    """The photo's value at the points over what a white diffuse base would show there, (N, 3), NaN where the photo does not show them;
-    and the cosine of the viewer's direction (N,)."""
+@dataclass(frozen=True)
+class Seen:
+    """How one photo sees N points. ok: Bool, in the picture, and neither camera nor flash is hidden. column, row: Float, pixels.
+    cos_v, cos_l: of the directions to the camera and to the flash, Float. inverse: 1 / distance² to the flash, Float."""
+
+    ok: Any
+    column: Any
+    row: Any
+    cos_v: Any
+    cos_l: Any
+    inverse: Any
+
+
+def seen_from(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, flash: FlashView) -> Seen:
+    """x, n: Vector3f, unit frame."""
     number = dr.opaque(mi.UInt32, view)
     eye = light_position(bank.cameras, number, mi.Vector3f(0))
     light = light_position(bank.cameras, number, mi.Vector3f(*[float(v) for v in flash.offset]))
     v, _ = incident(eye, x)
     l, inverse = incident(light, x)
-    cos_v, cos_l = dr.dot(n, v), dr.dot(n, l)
-    ok = (cos_v > LEAST_COSINE) & (cos_l > LEAST_COSINE)
     k = [dr.gather(mi.Vector4f, bank.cameras, number * 4 + j) for j in range(4)]
     d = x - eye
     r = [mi.Vector3f(k[1][c], k[2][c], k[3][c]) for c in range(3)]  # columns of world_from_camera
     z = dr.dot(r[2], d)
-    column = dr.floor(k[0].x * dr.dot(r[0], d) / z + k[0].z)
-    row = dr.floor(k[0].y * dr.dot(r[1], d) / z + k[0].w)
-    ok &= (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    pixel = mi.UInt32(dr.clip(row, 0, camera.height - 1)) * camera.width + mi.UInt32(dr.clip(column, 0, camera.width - 1))
-    p = dr.gather(mi.Vector4f, bank.rgbm, pixel + dr.gather(mi.UInt32, bank.offsets, number), ok)
-    ok &= p.w > 0.99
+    column = k[0].x * dr.dot(r[0], d) / z + k[0].z
+    row = k[0].y * dr.dot(r[1], d) / z + k[0].w
+    cos_v, cos_l = dr.dot(n, v), dr.dot(n, l)
+    ok = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (cos_v > 0) & (cos_l > 0)
     start = mi.Point3f(x + n * (2 * OFFSET))
     for end in (eye, light):
         to = end - mi.Vector3f(start)
         length = dr.norm(to)
         ok &= ~mesh.scene.ray_test(mi.Ray3f(start, to / length, length, 0.0, []), coherent=False, active=ok)
+    return Seen(ok, column, row, cos_v, cos_l, inverse)
+
+
+def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, coat: Coat, flash: FlashView):
+    """The photo's value at the points over what a white diffuse base would show there, (N, 3), NaN where the photo does not show them;
+    and the cosine of the viewer's direction (N,)."""
+    seen = seen_from(bank, camera, view, mesh, x, n, flash)
+    ok, cos_v, cos_l = seen.ok & (seen.cos_v > LEAST_COSINE) & (seen.cos_l > LEAST_COSINE), seen.cos_v, seen.cos_l
+    pixel = mi.UInt32(dr.clip(seen.row, 0, camera.height - 1)) * camera.width + mi.UInt32(dr.clip(seen.column, 0, camera.width - 1))
+    p = dr.gather(mi.Vector4f, bank.rgbm, pixel + dr.gather(mi.UInt32, bank.offsets, dr.opaque(mi.UInt32, view)), ok)
+    ok &= p.w > 0.99
     alpha = mi.Float(ALPHA)
     base = (
         coat.transmittance(cos_v, alpha) * coat.transmittance(cos_l, alpha) / (1 - coat.internal(alpha)) * cos_l * (dr.inv_pi / coat.ior**2)
     )
-    out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * inverse * flash.intensity, 1e-6)
+    out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * seen.inverse * flash.intensity, 1e-6)
     out = dr.select(ok, out, dr.nan)
     return np.array(out).T, np.array(cos_v)
+
+
+def network_features(
+    bank: PixelBank, cameras: list[Camera], mesh: TraceableMesh, x: np.ndarray, n: np.ndarray, flash: FlashView, network: DinoNetwork
+) -> np.ndarray:
+    """(N, 4) float32: the network's features on the points, for `Found.features`; 0 where no photo shows them."""
+    n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
+    point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
+    dr.eval(point, normal)
+    offsets = np.array(bank.offsets)
+
+    def photo(view: int) -> np.ndarray:
+        c = cameras[view]
+        pixels = dr.arange(mi.UInt32, c.width * c.height) + int(offsets[view])
+        return np.array(dr.gather(mi.Vector4f, bank.rgbm, pixels)).T.reshape(c.height, c.width, 4)[..., :3]
+
+    def places(view: int):
+        seen = seen_from(bank, cameras[view], view, mesh, point, normal, flash)
+        return np.array(seen.column), np.array(seen.row), np.array(dr.select(seen.ok, seen.cos_v, 0))
+
+    with dr.suspend_grad():
+        return dino_features(network, photo, places=places, cameras=cameras, count=len(x))[0]

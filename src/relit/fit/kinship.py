@@ -28,7 +28,7 @@ NEAREST = 4  # groups of a texel
 LADDER = np.geomspace(0.04, 0.75, 18)  # widths alpha that are tried
 COLUMNS = 4  # lobe of a specular albedo of 1, diffuse light as it is, diffuse light of an albedo of 1, photo
 FORGET = 0.8  # of the running sums per call
-PRIOR = (1e-3, 1e-2, 3e-3)  # belief in no change of specular albedo, factor and shift, against the evidence of the mean group
+PRIOR = (1e-4, 1e-5, 1e-5)  # belief in no change of specular albedo, factor and shift, against the evidence of the mean group
 
 
 @dataclass
