@@ -105,6 +105,29 @@ def test_posterior_silences_what_is_out_of_line():
     assert (posterior(np.array([5.0]), [1.0] * 5) == 1).all()  # too little is known yet
 
 
+def test_scale_is_exchanged_without_a_change_of_what_is_diffuse():
+    from relit.device import use_device
+
+    use_device("cpu")
+    from relit.fit.collection_surface import exchange_scale
+    from relit.fit.loop import Adam
+    from relit.materials.field import start_material
+
+    base = np.random.default_rng(0).uniform(0.1, 0.6, (8, 8, 3)).astype(np.float32)
+    material = start_material(8, base, 0.5, 0.0)
+    pull = np.zeros((8, 8, 4), np.float32)
+    pull[..., 0], pull[..., 2], pull[..., 3] = 1, -1, 5  # red is too bright, blue too dark; roughness has no part in it
+    before = np.array(material.colour).reshape(8, 8, 4)
+    move = exchange_scale(Adam(3), material, mi.Float(pull.ravel()), np.zeros((4, 3), np.float32), 0.05)
+    after = np.array(material.colour).reshape(8, 8, 4)
+    assert move[0] > 0.04 and abs(move[1]) < 1e-6 and move[2] < -0.04
+    assert np.allclose(after[..., :3] * np.exp(move), before[..., :3], rtol=1e-5)
+    assert (after[..., 3] == before[..., 3]).all()
+    assert (
+        exchange_scale(Adam(3), material, mi.Float(0 * pull.ravel()), np.full((4, 3), 0.2, np.float32), 0.05).max() < -0.04
+    )  # dimmer lights
+
+
 def test_seven_corrections_are_rays_of_corrected_cameras(capture):
     """Rays through corrected parameters equal those of the cameras that `corrected` builds; and their derivative is right."""
     import drjit as dr

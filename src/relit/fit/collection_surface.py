@@ -95,6 +95,7 @@ def fit_collection_surface(
     adam_colour, adam_metallic, adam_slope = (Adam(dr.width(p)) for p in (material.colour, material.metallic, material.slope))
     adam_slope.floor = options.slope_calm
     adam_c, adam_g = Adam(model.coefficients.size), Adam(model.gains.size)
+    adam_s = Adam(3)
     ratio = mi.Float(np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2))
     lights = PhotoLights(dr.exp(mi.Float(model.lights().ravel())), views)
     basis = light_prior()[1]
@@ -162,6 +163,9 @@ def fit_collection_surface(
             chroma = model.gains - model.gains.mean(1, keepdims=True)
             gg = gg + light.neutral / views * np.mean(chroma, 0)
         rate = light.rate * decay
+        if not frozen and options.exchange_rate > 0:
+            move = exchange_scale(adam_s, material, gradients[1], gg, options.exchange_rate * decay)
+            model.gains = model.gains + move
         c = adam_c.step(mi.Float(model.coefficients.ravel()), mi.Float(gc.astype(np.float32).ravel()), 2 * rate)
         k = adam_g.step(mi.Float(model.gains.ravel()), mi.Float(gg.astype(np.float32).ravel()), rate)
         dr.eval(c, k)
@@ -179,6 +183,21 @@ def fit_collection_surface(
 
     run_steps(stage, first, options.steps, step, state)
     return model
+
+
+def exchange_scale(adam: Adam, material: MaterialField, colour_gradient, gain_gradient: np.ndarray, rate: float) -> np.ndarray:
+    """One step along the valley in which all lights grow and the base colour shrinks, channel by channel (see fit/exchange.py). What is
+    not diffuse, reflections by a dielectric's F0 above all, tells the scale. gain_gradient: (V, 3). Returns what the log gains change by
+    (3,); the base colour has been divided by its exponential."""
+    base, pull = dr.unravel(mi.Vector4f, material.colour), dr.unravel(mi.Vector4f, colour_gradient)
+    sums = np.array([dr.sum(base[i] * pull[i])[0] for i in range(3)])
+    move = np.array(adam.step(dr.zeros(mi.Float, 3), mi.Float((gain_gradient.sum(0) - sums).astype(np.float32)), rate))
+    factor = [float(np.exp(-v)) for v in move]
+    scaled = [base[i] * dr.opaque(mi.Float, factor[i]) for i in range(3)]
+    material.colour = dr.ravel(mi.Vector4f(*scaled, base.w))
+    project(material)
+    dr.eval(material.colour)
+    return move.astype(np.float32)
 
 
 def residuals(a, b, target):
