@@ -71,6 +71,8 @@ class MultiviewOptions:
                 raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
 
 
+SMOOTH_COLOUR = 0.1  # of SurfaceOptions: here many photos see each place under one light
+
 WITHOUT = {  # what an ablation switches off: settings of the surface pass
     "interreflection": {},  # what blocks a direction is black
     "exchange": {"exchange_rate": 0.0},
@@ -123,7 +125,7 @@ def volume_options(o: MultiviewOptions) -> VolumeOptions:
 
 def surface_options(o: MultiviewOptions) -> SurfaceOptions:
     off = {key: value for name in o.without for key, value in WITHOUT[name].items()}
-    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **off)
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **{"smooth_colour": SMOOTH_COLOUR, **off})
 
 
 def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0) -> Asset:

@@ -47,13 +47,13 @@ class SurfaceOptions:
     texture: int = 512
     light: int = 64
     colour_rate: float = 0.01
-    roughness_rate: float = 0.015
+    roughness_rate: float = 0.03
     metallic_rate: float = 0.01
     light_rate: float = 0.05
     exchange_rate: float = 0.02
     exchange_rows: int = 4
     warm: float = 0.3
-    roughness_start: float = 0.3
+    roughness_start: float = 0.4
     smooth_roughness: float = 0.1
     smooth_metallic: float = 0.1
     smooth_colour: float = 0.2
@@ -215,12 +215,15 @@ def brightness(rgb, base, valid, power: float):
 
 
 def common_scale(surface, valid):
-    """Factor on the base colours of the valid points in priors: (ALBEDO_START / their mean) ** 0.5, Float of width 1, with its gradient.
+    """Factor on the base colours of the valid points in priors: (ALBEDO_START / their mean) ** 0.5 for each channel (Color3f of width 1),
+    with its gradient.
 
     Differences themselves shrink when everything darkens, and the light would brighten without end; relative differences shrink when a
     grey veil is laid over everything, and the light would dim. In between, as differences of display values do, they pull neither way.
+    One factor for all channels would let the least visible ones go dark, under a tinted light.
     """
-    return dr.sqrt(ALBEDO_START / dr.maximum(weighted_mean(mi.luminance(surface.base), dr.select(valid, mi.Float(1), 0)), 1e-3))
+    w = dr.select(valid, mi.Float(1), 0)
+    return mi.Color3f(*[dr.sqrt(ALBEDO_START / dr.maximum(weighted_mean(c, w), 1e-3)) for c in surface.base])
 
 
 def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing):
