@@ -102,7 +102,7 @@ FLASH = Suite(
         Item("teapot", TEA, (), {"nodes": ["tea_set_01_teapot_01", "tea_set_01_teapot_01_lid"]}),
         Item("cup", TEA, (), {"nodes": ["tea_set_01_cup_small_01"]}),  # concave: its inside lights itself
     ),
-    options={"views": 120, "test_views": 20, "resolution": 400, "spp": 64, "test_spp": 256, "seed": 0},
+    options={"views": 120, "test_views": 20, "resolution": 400, "spp": 64, "test_spp": 64, "seed": 0},
     synthesize="relit.capture.synthetic_flash.synthesize_flash",
     evaluate="relit.evaluate.flash.evaluate_flash",
     bars={

@@ -222,7 +222,7 @@ def _test_maps(out: Path, scene, name: str, camera: Camera) -> None:
     target = out / "truth" / "normal" / f"{name}.exr"
     if target.exists():
         return
-    maps = render_maps(scene, camera, spp=64)
+    maps = render_maps(scene, camera, spp=256)
     for key, folder in MAPS.items():
         m = maps[key]
         cover = maps["coverage"] if m.ndim == 2 else maps["coverage"][..., None]
