@@ -227,6 +227,28 @@ def test_noise_is_no_object(tmp_path):
     assert raised.value.code == 4
 
 
+def test_verdicts():
+    """A mean score or an agreement that is too low ends the run; a photo far below the others is named."""
+    from types import SimpleNamespace
+
+    from relit.fit.collection import judge_poses
+    from relit.fit.collection_options import CollectionOptions
+
+    said = []
+    run, options = SimpleNamespace(say=said.append), CollectionOptions()
+    shots = [SimpleNamespace(photo=SimpleNamespace(name=f"{i}.jpg")) for i in range(14)]
+    scores = np.full(14, 0.95) + np.linspace(-0.01, 0.01, 14)
+    scores[5] = 0.7
+    judge_poses(scores, 0.4, shots, options, run)
+    assert any("1 photos agree badly" in text and "5.jpg" in text for text in said)
+    judge_poses(scores, np.nan, shots, options, run)
+    assert any("nothing tells" in text for text in said)
+    for low, share in ((scores - 0.3, 0.4), (scores, 0.1)):
+        with pytest.raises(UserError, match="could not be found") as raised:
+            judge_poses(low, share, shots, options, run)
+        assert raised.value.code == 4
+
+
 def test_unknown_ablation(tmp_path):
     with pytest.raises(UserError) as raised:
         reconstruct(photos(tmp_path / "in", blob), tmp_path / "run", "without=multiplexx")

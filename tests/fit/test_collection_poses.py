@@ -80,3 +80,15 @@ def test_ablation_without_search_keeps_the_hints(photos):
     poses, scores = find_poses(crops, hints, 45.0, schedule_of(2), 1, 1, ("search",), 0, lambda *_: None, 3)
     eyes = poses[:, :3, 3] / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
     assert (eyes * hints).sum(1).min() > 0.97 and (scores == 1).all()
+
+
+def test_agreement_tells_right_poses_from_wrong_ones(photos):
+    from relit.fit.collection_poses import agreement, even_colours
+    from relit.fit.register import crop_photo
+
+    crops = even_colours([crop_photo(*p) for p in photos])
+    right = np.array([c.world_from_camera for *_, c in photos])
+    wrong = right[np.random.default_rng(3).permutation(len(right))]
+    coarse = {"nodes": 24, "steps": 20, "views": 150, "within": 30.0}
+    assert agreement(crops, right, 0, **coarse) >= 0.5
+    assert agreement(crops, wrong, 0, **coarse) <= 0.2

@@ -24,7 +24,7 @@ from relit.errors import UserError
 from relit.fit.collection_held_out import held_out_stage, look_again
 from relit.fit.collection_options import CollectionOptions, options_for
 from relit.fit.collection_photos import Shot, crops_of, load_shots
-from relit.fit.collection_poses import GREY, find_poses, schedule_of
+from relit.fit.collection_poses import GREY, agreement, find_poses, schedule_of
 from relit.fit.collection_surface import fit_collection_surface, light_options, posterior, start_collection_surface
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras
@@ -44,6 +44,7 @@ from relit.scene import Asset, Camera, Capture, Material, Mesh
 
 __all__ = ["CollectionOptions", "options_for", "reconstruct"]
 LIGHT = "one light per photo (collection)"
+CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("poses", "volume", "second_look", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
 COST = {"draft": (150.0, 1.2e9), "standard": (700.0, 2.0e9), "high": (2500.0, 3.0e9)}
@@ -89,27 +90,36 @@ def pose_stage(shots: list[Shot], degrees: float, run, options: CollectionOption
             except ValueError as error:
                 why = f"{error}: the masks belong to different objects, or are wrong"
                 raise UserError("no shape agrees with the photos", why, "look at the masks (relit inspect)", code=4) from None
-            kept = {"poses": poses, "scores": scores}
+            share = agreement(crops, poses, seed) if len(shots) >= CHECKED and "search" not in options.without else np.nan
+            kept = {"poses": poses, "scores": scores, "agreement": np.array(share)}
             stage.save("poses", **kept)
-        judge_poses(kept["scores"], shots, options.least_score, run)
+        judge_poses(kept["scores"], float(kept["agreement"]), shots, options, run)
     poses, scores = kept["poses"], kept["scores"]
     loss = 1 - scores
     weights = np.ones(len(shots)) if "posterior" in options.without else posterior(loss, [*loss, *loss][:1000] * (20 // len(loss) + 1))
     return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)], weights
 
 
-def judge_poses(scores: np.ndarray, shots: list[Shot], least: float, run) -> None:
-    """Say how well the photos agree, and which do not. Raises UserError (code 4) when the poses are wrong as a whole."""
-    mean = float(np.mean(scores))
+def judge_poses(scores: np.ndarray, share: float, shots: list[Shot], options: CollectionOptions, run) -> None:
+    """Say how well the photos agree, and which do not. share: see `agreement`, NaN where it was not tried. Raises UserError (code 4) when
+    the poses are wrong as a whole."""
+    mean, least = float(np.mean(scores)), options.least_score
     run.say(f"mean score of the registration {mean:.3f} (1 is perfect; below {least} is a failure)")
+    if np.isfinite(share):
+        run.say(f"{share:.0%} of the photos find their place in a model of the others (below {options.least_agreement:.0%} is a failure)")
+    else:
+        run.say(f"note: with fewer than {CHECKED} photos nothing tells whether the poses are right: look at the result")
     worst = np.argsort(scores)
     low = [k for k in worst if scores[k] < np.median(scores) - 4 * max(float(np.median(np.abs(scores - np.median(scores)))), 0.004)]
     if low:
         named = ", ".join(f"{shots[k].photo.name} ({scores[k]:.2f})" for k in low[:5])
         run.say(f"note: {len(low)} photos agree badly with the others (another object, a wrong mask or a wrong pose): {named}")
-    if mean < least:
+    if mean < least or share < options.least_agreement:
+        told = f"score {mean:.3f}, {least} is needed"
+        if share < options.least_agreement:
+            told = f"{share:.0%} find their place in a model of the others, {options.least_agreement:.0%} are needed"
         raise UserError(
-            f"where the photos were taken from could not be found: they agree with no common shape (score {mean:.3f}, {least} is needed)",
+            f"where the photos were taken from could not be found: they agree with no common shape ({told})",
             "too few photos, wrong masks, photos of different objects, quadrants of other photos, or an object alike from all sides",
             "look at the masks; answer `relit quadrants PHOTOS`; add photos between those that are far apart",
             code=4,

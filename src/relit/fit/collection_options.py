@@ -14,7 +14,8 @@ class CollectionOptions:
     """side: pixels of the photos' longer side. rounds: of coarse fit and registration. polish: turns of descent and search after them.
     keep: hypotheses of each photo that are refined (SAMURAI's multiplex). hints: whether quadrants or angles are used. holdout: every so
     many photos are set aside (0: none but those of held_out.json). starts: photos that growth begins from without hints. least_score: of
-    the registration, on average, below which the poses are taken for wrong. levels, level_steps, rays: of the volume pass.
+    the registration, on average, and least_agreement: share of photos that find their place in a model of the others, below which the
+    poses are taken for wrong. levels, level_steps, rays: of the volume pass.
     refine_cameras: step of the camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass.
     frozen_steps: of the fit of held-out photos. without: what an ablation switches off.
     """
@@ -27,6 +28,7 @@ class CollectionOptions:
     holdout: int = 0
     starts: int = 4
     least_score: float = 0.84
+    least_agreement: float = 0.2
     levels: tuple[int, ...] = (64, 128)
     level_steps: tuple[int, ...] = (400, 500)
     rays: int = 6144

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from relit.cameras.se3 import look_at
+from relit.cameras.se3 import look_at, rotation_angle
 from relit.conventions import similarity
 from relit.fit.pixels import corrected, make_bank
 from relit.fit.register import (
@@ -210,6 +210,24 @@ def polish(crops: list[Crop], poses: np.ndarray, directions: np.ndarray, degrees
             scores,
         )
     return gauge(crops, poses), scores
+
+
+def agreement(crops: list[Crop], poses: np.ndarray, seed: int, within=20.0, nodes=40, steps=90, views=400) -> float:
+    """Share of photos that a search without hints puts within so many degrees of their pose, in a model of the other half of the photos.
+
+    A score alone does not tell a mush that all photos went into from a shape: photos that the model has not seen do. Right poses of
+    Spot, BoomBox and a stool (alike from four sides) gave 1.0, .50 and .35, wrong ones of BoomBox .08, at scores of .96, .93, .95 and .87.
+    """
+    order, found = np.random.default_rng(seed).permutation(len(crops)), 0
+    whole = gauge(crops, poses)
+    for half in (0, 1):
+        seen, unseen = np.sort(order[half::2]), np.sort(order[1 - half :: 2])
+        model = coarse_model([crops[k] for k in seen], whole[seen], nodes, steps, 0.15, seed + half)
+        gallery = make_gallery(volume_render(model), views_from(directions_around(views, seed + half)), PARTS)
+        some = [crops[k] for k in unseen]
+        again = search(some, gallery, 1, rings=crop_rings(some, PARTS)).poses[:, 0]
+        found += sum(rotation_angle(p[:3, :3].T @ q[:3, :3]) < within for p, q in zip(again, poses[unseen], strict=True))
+    return found / len(crops)
 
 
 # ---------------------------------------------------------------- without hints
