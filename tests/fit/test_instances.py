@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3, nearest_rotation, rotation_angle
+from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
-from relit.fit.instance_search import consistent, distinct, trusted
-from relit.fit.instances import carved, first_pose, frame_scale, inflated, pixel_bank, views_of
+from relit.fit.instance_growth import Growth, grow, linked_poses
+from relit.fit.instance_search import Guesses, crops_of, first_pairs, trusted
+from relit.fit.instances import carved, first_pose, fit_model, frame_scale, inflated, pixel_bank, views_of
 from relit.fit.pile_scene import find_ground
+from relit.fit.register import crop_rings
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
@@ -67,35 +69,82 @@ def test_carving_keeps_what_unknown_pixels_may_hide():
     assert (carved([v, everywhere], poses, 24, 0.0) < 0).sum() > 1.05 * (carved([blind, everywhere], poses, 24, 0.0) < 0).sum()
 
 
-def test_the_orientations_that_most_guesses_support_are_found():
-    rng = np.random.default_rng(1)
-    n, keep = 7, 3
-    truth = np.array([exp_so3(rng.normal(size=3)) for _ in range(n)])
-    rotations, scores = np.zeros((n, n, keep, 3, 3)), np.full((n, n, keep), 0.86)
-    for s in range(n):
-        for j in range(n):
-            for k in range(keep):
-                rotations[s, j, k] = exp_so3(rng.normal(size=3) * 2)
-            if rng.uniform() < 0.6:  # one of the guesses is right within some degrees, not always the best one
-                rotations[s, j, rng.integers(keep)] = exp_so3(rng.normal(size=3) * 0.08) @ truth[j] @ truth[s].T
-    found = consistent(rotations, scores, list(range(n)), 22.0)[0][1]
-    frame = nearest_rotation(np.einsum("nji,njk->ik", found, truth))
-    assert max(rotation_angle((a @ frame).T @ b) for a, b in zip(found, truth, strict=True)) < 12
+def test_growth_starts_from_the_best_pairs_and_no_instance_twice():
+    scores = np.array([[-1, 0.9, 0.5, 0.7], [0.95, -1, 0.6, 0.8], [0.4, 0.3, -1, 0.85]])[..., None]
+    guesses = Guesses(np.zeros((3, 4, 1, 4, 4)), scores)
+    assert first_pairs(guesses, [0, 1, 2], 5) == [(1, 0), (2, 3)]
+    assert first_pairs(guesses, [0, 1, 2], 1) == [(1, 0)]
+    assert guesses.chance == pytest.approx(0.7)
 
 
-def test_a_strong_link_from_matching_decides_between_guesses():
-    turn = exp_so3(np.array([0, 0, 1.5]))
-    rotations, scores = np.tile(np.eye(3), (2, 2, 1, 1, 1)), np.full((2, 2, 1), 0.85)
-    found = consistent(rotations, scores, [0, 1], 22.0, links=[(0, 1, turn, 1.0)])[0][1]
-    assert rotation_angle(found[1] @ found[0].T @ turn.T) < 15
+def test_a_link_from_matching_gives_a_pose_from_either_side():
+    labels = np.zeros((120, 200), np.int32)
+    cv2.circle(labels, (50, 60), 20, 1, -1)
+    cv2.circle(labels, (150, 60), 20, 2, -1)
+    views = views_of(np.zeros((120, 200, 3), np.float32), labels, CAMERA, 10**6)
+    placed = similarity(exp_so3(np.array([0.3, -0.2, 0.9])), np.zeros(3))
+    turn = exp_so3(np.array([0.1, 0.7, -0.4]))
+    for link in ((0, 1, turn), (1, 0, turn.T)):
+        found = linked_poses(views, np.stack([placed, np.eye(4)]), [0], [1], [link], 5.0)
+        # photo_from_object of the second is the turn after that of the first
+        assert np.allclose(found[1][:3, :3].T, turn @ placed[:3, :3].T)
+        middle = CAMERA.with_pose(found[1]).project(np.zeros((1, 3)))[0]
+        assert np.allclose(middle[:2], [150.5, 60.5], atol=0.6) and middle[2] == pytest.approx(5.0, rel=0.02)
+    assert linked_poses(views, np.stack([placed, np.eye(4)]), [0], [1], [], 5.0) == {}
 
 
-def test_sets_that_differ_only_by_their_frame_are_one():
-    rng = np.random.default_rng(2)
-    a = np.array([exp_so3(rng.normal(size=3)) for _ in range(5)])
-    b = a @ exp_so3(np.array([0.3, 1.0, 0.2]))
-    c = np.array([exp_so3(rng.normal(size=3)) for _ in range(5)])
-    assert len(distinct([(3.0, a), (2.0, b), (1.0, c)], 5)) == 2
+def test_views_across_bound_what_one_leaves_open_in_depth():
+    labels = np.zeros((120, 200), np.int32)
+    cv2.rectangle(labels, (90, 30), (110, 90), 1, -1)  # a rod
+    view = views_of(np.zeros((120, 200, 3), np.float32), labels, CAMERA, 10**6)[0]
+    disc = np.zeros((120, 200), np.int32)
+    cv2.circle(disc, (100, 60), 30, 1, -1)
+    side = views_of(np.zeros((120, 200, 3), np.float32), disc, CAMERA, 10**6)[0]
+    front = similarity(np.eye(3), [0, 0, -6])
+    across = similarity(exp_so3(np.array([0, np.pi / 2, 0])), [-6, 0, 0])
+    poses = np.stack([front, across])
+    bounded = (carved([view, side], poses, 24, 0.0, 1.0) < 0).sum()
+    free = (carved([view, side], poses, 24, 0.0, 1.0, crossed=True) < 0).sum()
+    assert free > 1.5 * bounded  # a plate that is as deep as the disc
+    near = np.stack([front, front])
+    assert (carved([view, side], near, 24, 0.0, 1.0, crossed=True) < 0).sum() == (carved([view, side], near, 24, 0.0, 1.0) < 0).sum()
+
+
+def painted(angles) -> tuple[list, np.ndarray]:
+    """Views of an ellipsoid with a colour for each octant, turned by `angles` (degrees about +y), and their poses."""
+    axes, side = np.array([0.5, 0.35, 0.7]), 96
+    u, v = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5)
+    camera = Camera(side, side, 260.0, 260.0, side / 2, side / 2, np.eye(4))
+    d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    views, poses = [], []
+    for k, a in enumerate(angles):
+        turn = exp_so3(np.array([0.2, np.radians(a), 0.0]))
+        pose = similarity(turn, -5.0 * turn[:, 2])
+        o, w = pose[:3, 3] / axes, (d @ turn.T) / axes
+        b, e, c = (w * o).sum(-1), (w * w).sum(-1), o @ o - 1
+        root = b * b - e * c
+        p = (o + w * ((-b - np.sqrt(np.maximum(root, 0))) / e)[..., None]) * axes
+        colour = 0.15 + 0.7 * (p > np.array([0.05, 0.0, -0.1]))
+        mask = (root > 0).astype(np.float32)
+        rgb = (colour * mask[..., None]).astype(np.float32)
+        views += views_of(rgb, (mask > 0).astype(np.int32) * (k + 1), camera, 10**6)
+        poses.append(pose)
+    return views, np.array(poses)
+
+
+def test_an_instance_joins_those_that_stand_and_poses_wait_for_the_shape():
+    views, truth = painted([0, 20, 40])
+    parts = (0.6, 2.0, 0.1)
+    crops = crops_of(views)
+    o = Growth(nodes=24, steps=12, viewpoints=300, keep=1, cone=45.0)
+    start = truth.copy()
+    start[2] = np.eye(4)
+    poses, scores = grow(views, crops, crop_rings(crops, parts), parts, [0, 1], start, o)
+    assert rotation_angle(poses[2][:3, :3].T @ truth[2][:3, :3] @ (poses[0][:3, :3].T @ truth[0][:3, :3]).T) < 15
+    assert scores.min() > 0.8
+    values = carved(views, truth, 24, 0.0)
+    assert np.allclose(fit_model(views, truth, values, 3, refine_cameras=0.01, hold=3)[1], truth)
+    assert not np.allclose(fit_model(views, truth, values, 3, refine_cameras=0.01, hold=1)[1], truth, atol=1e-4)
 
 
 def test_instances_with_low_scores_are_not_trusted():

@@ -40,10 +40,8 @@ STAGES = ("poses", "volume", "mesh", "surface")
 FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
 COST = {"draft": (60.0, 1.0e9), "standard": (300.0, 2.0e9), "high": (1200.0, 3.0e9)}
+HOLD = 40  # steps of the volume pass before poses move
 AGREES = 0.2  # an instance whose score lies further below the median did not find its place
-# weight of a rotation from matching, as of a guess with a score of .82: few views and a long lens leave tilt and depth uncertain by tens
-# of degrees
-LINKED = 0.05
 
 
 @dataclass(frozen=True)
@@ -55,11 +53,11 @@ class DuplicatesOptions:
     """
 
     side: int = 320
-    search_rounds: int = 3
+    search_rounds: int = 1
     levels: tuple[int, ...] = (64, 128)
-    level_steps: tuple[int, ...] = (300, 400)
+    level_steps: tuple[int, ...] = (400, 500)
     rays: int = 6144
-    refine_poses: float = 0.002
+    refine_poses: float = 0.004
     faces: int = 16_000
     texture: int = 512
     surface_steps: int = 900
@@ -88,7 +86,6 @@ WITHOUT = {
 PRESETS = {
     "draft": {
         "side": 200,
-        "search_rounds": 3,
         "levels": (48, 96),
         "level_steps": (150, 200),
         "rays": 4096,
@@ -188,7 +185,7 @@ def poses_stage(pixels, camera: Camera, run, options: DuplicatesOptions, seed: i
 
 
 def matched(pixels, camera: Camera, run, options: DuplicatesOptions, seed: int) -> tuple:
-    """Links of pairs by rotation-swept feature matching: (i, j, rotation of i onto j, weight), see `fit.instance_search.consistent`."""
+    """Links of pairs by rotation-swept feature matching: (i, j, rotation of i onto j in the photo)."""
     from relit.cameras.duplicates import find_features, link_instances, map_instances
     from relit.cameras.sfm import _quiet
     from relit.device import load_pycolmap
@@ -207,8 +204,8 @@ def matched(pixels, camera: Camera, run, options: DuplicatesOptions, seed: int) 
         members = sorted(cluster)
         run.say(f"matching links the instances {', '.join(str(names[k]) for k in members)}")
         together |= {(i, j) for i in members for j in members if i < j}
-        out += [(i, j, cluster[j][:3, :3] @ cluster[i][:3, :3].T, LINKED) for i in members for j in members if i < j]
-    out += [(i, j, link.rotation, 0.5 * LINKED) for (i, j), link in links.items() if link.rotation is not None and (i, j) not in together]
+        out += [(i, j, cluster[j][:3, :3] @ cluster[i][:3, :3].T) for i in members for j in members if i < j]
+    out += [(i, j, link.rotation) for (i, j), link in links.items() if link.rotation is not None and (i, j) not in together]
     return tuple(out)
 
 
@@ -235,7 +232,7 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
         inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
         try:
-            values = carved(views, poses, options.levels[0], 0.15, Search.depth)
+            values = carved(views, poses, options.levels[0], 0.15, Search.depth, crossed=True)
         except ValueError:
             raise UserError(
                 "the silhouettes have nothing in common",
@@ -249,7 +246,9 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
         rate = 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
         if rate > 0:
             move_poses(bank, model)
-        fit_volume(bank, model, VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate), stage, seed)
+        fit_volume(
+            bank, model, VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=HOLD), stage, seed
+        )
     poses = moved_poses(bank, views, poses)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         mesh, how = unwrap(extract_mesh(dense_values(model.grid), faces=options.faces), options.texture)

@@ -32,6 +32,7 @@ from relit.scene import Camera
 
 COARSE = 160  # pixels, longer side of a window while poses are searched
 MARGIN = 0.15  # of a window around its instance, of its size
+ACROSS = 50  # degrees from which another view bounds what this one leaves open in depth
 OBJECT_RADIUS = 0.8  # of the widest silhouette, in the unit frame
 
 
@@ -146,16 +147,21 @@ def inflated(view: View, pose: np.ndarray, n: int, depth: float = 1.2, most: flo
     return distance_of(inside.reshape(n, n, n))
 
 
-def carved(views: list[View], poses: np.ndarray, n: int, tolerance: float, depth: float | None = None) -> np.ndarray:
+def carved(
+    views: list[View], poses: np.ndarray, n: int, tolerance: float, depth: float | None = None, *, crossed: bool = False
+) -> np.ndarray:
     """Signed distance of what lies inside nearly all silhouettes: a node is out where more than `tolerance` of the views that know show
     background there. Raises ValueError when nothing is left.
 
     depth: a view also counts a node as out that lies farther before or behind the object's middle than `depth` times the distance to the
-    outline, and a little: views from nearly one side would leave a body as deep as the ball.
+    outline, and a little: views from nearly one side would leave a body as deep as the ball. crossed: poses are good enough that a view
+    need not be bounded so where another looks across it (at ACROSS degrees or more).
     """
     p = node_positions(n).reshape(-1, 3)
     told, empty = np.zeros(len(p)), np.zeros(len(p))
-    for view, pose in zip(views, poses, strict=True):
+    seen = poses[:, :3, 3] / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
+    across = crossed & (np.abs(seen @ seen.T).min(1) < np.cos(np.radians(ACROSS)))
+    for view, pose, bounded in zip(views, poses, across, strict=True):
         camera = view.camera.with_pose(pose)
         q = camera.project(p)
         u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
@@ -163,7 +169,7 @@ def carved(views: list[View], poses: np.ndarray, n: int, tolerance: float, depth
         u, v = np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1)
         known = np.where(ok, view.known[v, u], 1.0) > 0.5
         out = ~(ok & (view.mask[v, u] > 0.3))
-        if depth is not None:
+        if depth is not None and not bounded:
             middle = float(np.linalg.norm(camera.centre))
             room = distance_transform_edt(np.pad((view.mask > 0.5) | (view.known < 0.5), 1))[1:-1, 1:-1] / camera.fx * middle
             out |= np.abs(p @ (camera.centre / middle)) > depth * room[v, u] + 0.1
@@ -174,9 +180,17 @@ def carved(views: list[View], poses: np.ndarray, n: int, tolerance: float, depth
 
 
 def fit_model(
-    views: list[View], poses: np.ndarray, values: np.ndarray, steps: int, *, refine_cameras: float = 0.0, rays: int = 4096, seed: int = 0
+    views: list[View],
+    poses: np.ndarray,
+    values: np.ndarray,
+    steps: int,
+    *,
+    refine_cameras: float = 0.0,
+    hold: int = 0,
+    rays: int = 4096,
+    seed: int = 0,
 ) -> tuple[VolumeModel, np.ndarray]:
-    """A coarse model from start distances; (model, poses with the corrections that the fit has found)."""
+    """A coarse model from start distances; (model, poses with the corrections that the fit has found). hold: steps before poses move."""
     bank = pixel_bank(views, poses)
     inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
     model = start_model(values, np.maximum(inside.mean(0), 1e-3), None, full=False)
@@ -184,7 +198,7 @@ def fit_model(
     model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
     if refine_cameras > 0:
         move_poses(bank, model)
-    options = VolumeOptions((values.shape[0],), (steps,), rays, sharpness=(1.5, 4.0), refine_cameras=refine_cameras)
+    options = VolumeOptions((values.shape[0],), (steps,), rays, sharpness=(1.5, 4.0), refine_cameras=refine_cameras, hold=hold)
     fit_volume(bank, model, options, NoStage(), seed)
     return model, moved_poses(bank, views, poses)
 

@@ -43,6 +43,7 @@ class VolumeOptions:
     -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the value: noise of the grid's own scale dies out,
     curvature stays. band: half width of the optimised band, voxels. calm: see Adam's floor: distances with little evidence, such as
     under a glossy coat, are left to the smoothing. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
+    hold: steps before the cameras move: they would follow the shape that the pass begins with.
     """
 
     levels: tuple[int, ...] = (64, 128, 192)
@@ -59,6 +60,7 @@ class VolumeOptions:
     band: float = 5.0
     calm: float = 0.5
     refine_cameras: float = 0.0
+    hold: int = 0
 
 
 @dataclass
@@ -137,7 +139,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
     grid = model.grid
     h, count = grid.h, options.rays
     rng = mi.PCG32(size=count, initstate=seed * 7919 + begin)
-    refine = options.refine_cameras > 0
+    refine = options.refine_cameras > 0 and end > options.hold
     adam = {
         "sdf": Adam(grid.rows, floor=options.calm),
         "features": Adam(grid.rows * grid.channels),
@@ -197,7 +199,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
             model.background.cells = adam["background"].step(dr.detach(model.background.cells), gradients[3], 0.05 * decay)
         if refine:
             ratio = model.extra.get("correction_rates", 1.0)  # Float as wide as the corrections
-            bank.corrections = camera_adam.step(dr.detach(bank.corrections), gradients[-1], options.refine_cameras * decay, ratio)
+            rate = options.refine_cameras * decay if i >= options.hold else 0.0
+            bank.corrections = camera_adam.step(dr.detach(bank.corrections), gradients[-1], rate, ratio)
         dr.eval(grid.row_values)
         write_rows(grid)
         return report
