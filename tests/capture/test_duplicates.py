@@ -52,6 +52,19 @@ def test_sfd_folder_with_focal_as_text_and_a_photo_that_is_not_square(tmp_path):
     assert numbers(capture) == [0, 60, 100, 140]
 
 
+def test_normal_priors_in_the_axes_of_sfd_and_in_our_own(tmp_path):
+    folder, seen = sfd(tmp_path / "c"), np.array([0.0, 0.6, 0.8])  # up and towards the camera, y up
+    code = np.full((H, W, 3), 255, np.uint8)  # white: not known
+    code[20:70] = np.round((seen * 0.5 + 0.5) * 255)[::-1]
+    cv2.imwrite(str(folder / "train" / "000_normal_pretrain.png"), code)
+    capture = open_capture(folder)
+    normal = capture.photos[0].load().normal
+    assert np.allclose(normal[40, 50], [0, -0.6, -0.8], atol=0.01) and np.allclose(normal[90, 50], 0)
+    assert any("normal priors" in n for n in capture.notes)
+    cv2.imwrite(str(folder / "train" / "000_normal.png"), code)  # named as elsewhere: the photo's own axes
+    assert np.allclose(open_capture(folder).photos[0].load().normal[40, 50], seen, atol=0.01)
+
+
 def test_a_focal_length_from_the_command_line_wins(tmp_path):
     assert open_capture(sfd(tmp_path / "c"), focal=200.0).photos[0].camera.fx == 200.0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from relit.asset.gltf import write_glb
 from relit.capture import open_capture
 from relit.capture.procedural import pawn
 from relit.capture.synthetic_duplicates import heap, synthesize_duplicates
-from relit.conventions import scale_of
+from relit.conventions import scale_of, similarity
 from relit.errors import UserError
 from relit.evaluate.protocols import evaluate
 from relit.fit import duplicates as recipe
@@ -53,6 +54,11 @@ def true_poses(pile):
     return np.array(poses)
 
 
+def middle_of_pawn():
+    vertices = pawn(rows=16, columns=20, texture=32)[0].vertices
+    return (vertices.min(0) + vertices.max(0)) / 2
+
+
 def test_objects_of_a_heap_stand_on_the_ground_and_hardly_in_one_another():
     mesh, _ = pawn(rows=16, columns=20, texture=32)
     poses, reach = heap(mesh, 6, 0, 12.0, 1.0)
@@ -85,6 +91,19 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     for name in ("albedo_psnr", "relit_psnr", "novel_psnr", "roughness_mse", "environment_mse"):
         assert np.isfinite(metrics[name]["value"])
     assert (tmp_path / "run" / "asset" / "scene.glb").is_file() and load_asset(tmp_path / "run").ground is not None
+    # the same photo without its truth, SfD's poses beside it
+    real = tmp_path / "real"
+    shutil.copytree(pile, real, ignore=shutil.ignore_patterns("truth"))
+    told = evaluate(tmp_path / "run", real, spp=4)["metrics"]
+    assert set(told) == {"photo_psnr"} and told["photo_psnr"]["value"] == pytest.approx(metrics["photo_psnr"]["value"], abs=0.01)
+    listed = {
+        f"{k:03d}": i["world_from_object"] for k, i in enumerate(json.loads((pile / "truth" / "truth.json").read_text())["instances"])
+    }
+    (real / "object_pred_pose.json").write_text(json.dumps(listed))
+    (real / "object_scale_matrix.json").write_text(json.dumps({"scale_matrix": similarity(np.eye(3), middle_of_pawn()).tolist()}))
+    told = evaluate(tmp_path / "run", real, spp=4)["metrics"]
+    for name in ("rotation_median", "rotation_pairs", "registered", "rotation_before"):
+        assert told[name]["value"] == pytest.approx(metrics[name]["value"], abs=1e-6)
 
 
 def test_switched_off_parts_are_checked_by_name():

@@ -40,7 +40,13 @@ def test_windows_look_at_the_same_pixels_and_know_what_another_object_may_hide()
     other = labels[top : top + h, left : left + w] == 9
     assert (v.known[other] == 0).all() and (v.known[(v.mask > 0)] == 1).all()
     assert 0.5 < v.seen < 1
-    bank = pixel_bank(views, np.tile(similarity(np.eye(3), [0, 0, -6]), (2, 1, 1)))
+    poses = np.tile(similarity(np.eye(3), [0, 0, -6]), (2, 1, 1))
+    bank = pixel_bank(views, poses)
+    assert bank.normals is None
+    normal = np.tile(np.array([0, 0, -1], np.float32), (120, 200, 1))
+    told = np.array(pixel_bank(views_of(rgb, labels, CAMERA, 10**6, normal), poses).normals).reshape(-1, 4)
+    assert np.array_equal(told[:, 3] > 0, np.concatenate([x.mask.ravel() for x in views]) > 0)  # on the object itself only
+    assert np.allclose(told[told[:, 3] > 0], [0, 0, -1, 1])
     drawn = np.array(bank.candidates)
     hidden = np.flatnonzero(np.concatenate([x.known.ravel() for x in views]) == 0)
     assert len(drawn) and not set(drawn.tolist()) & set(hidden.tolist())

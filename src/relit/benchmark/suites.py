@@ -171,7 +171,8 @@ DUPLICATES = Suite(
         "chamfer": ("<=", 0.03),
     },
     ablations={
-        name: (f"without={name}",) for name in ("rotation_sweep", "matching", "search", "refinement", "visibility", "metal", "ground")
+        name: (f"without={name}",)
+        for name in ("rotation_sweep", "matching", "search", "refinement", "visibility", "metal", "ground", "normals")
     },
 )
 

@@ -25,6 +25,7 @@ from relit.images import EXTENSIONS, read_header
 from relit.scene import Camera, Capture, Photo, Pixels
 
 SUFFIXES = ("_instance_seg", "_labels", "_instances", "_seg")
+SFD_NORMALS = "_normal_pretrain.png"  # SfD's: y up, z towards the camera
 CUTOUTS = ("cutouts", "cut-outs", "instances")
 LEAST_SIDE = 24  # pixels; smaller objects carry no pose
 MOST = 1000  # objects
@@ -43,13 +44,18 @@ class Source:
 
 @dataclass(frozen=True)
 class Labelled:
-    """Adds the labels to what `load` returns. labels: (H, W) int32 at the decoded size."""
+    """Adds the labels to what `load` returns. labels: (H, W) int32 at the decoded size. upward: the file's normals have y up and z towards
+    the camera."""
 
     load: Callable[[], Pixels]
     labels: np.ndarray
+    upward: bool = False
 
     def __call__(self) -> Pixels:
-        return replace(self.load(), labels=self.labels, mask=(self.labels > 0).astype(np.float32))
+        pixels = self.load()
+        if self.upward and pixels.normal is not None:
+            pixels = replace(pixels, normal=pixels.normal * np.array([1, -1, -1], np.float32))
+        return replace(pixels, labels=self.labels, mask=(self.labels > 0).astype(np.float32))
 
 
 def recognise(path: Path) -> Source | None:
@@ -120,8 +126,13 @@ def open_duplicates(source: Source, *, focal: float | None = None, max_side: int
     camera = Camera(w, h, f, f, w / 2, h / 2, pose).resized(*size)
     labels = labels if scale == 1 else cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
     name = source.photo.relative_to(source.root).as_posix()
-    normal = next((p for p in (source.photo.with_name(f"{source.photo.stem.removesuffix('_rgb')}_normal.png"),) if p.is_file()), None)
-    load = Labelled(Decoder(source.photo, size, normal=normal, orientation=header.orientation), labels.astype(np.int32))
+    stem = source.photo.stem.removesuffix("_rgb")
+    beside = (source.photo.with_name(stem + end) for end in ("_normal.png", "_normal.exr", SFD_NORMALS))
+    normal = next((p for p in beside if p.is_file()), None)
+    upward = normal is not None and normal.name.endswith(SFD_NORMALS)
+    load = Labelled(Decoder(source.photo, size, normal=normal, orientation=header.orientation), labels.astype(np.int32), upward)
+    if normal is not None:
+        notes.append(f"normal priors in {normal.name}")
     notes.append(f"{len(np.unique(labels[labels > 0]))} objects in {source.labels.name}")
     photo = Photo(name, load, *size, camera=camera, focal_hint=header.focal)
     return Capture(source.root, "duplicates", (photo,), notes=tuple(notes), kind="duplicates")

@@ -79,6 +79,7 @@ WITHOUT = {
     "search": "what matching does not link is dropped",
     "refinement": "poses stay as search has found them",
     "visibility": "no instance, and no ground, shadows another",
+    "normals": "normal priors are not used",
     "metal": "no term pulls metallic to 0 or 1",
     "ground": "no ground is looked for",
 }
@@ -116,7 +117,8 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     view_camera = camera.with_pose(np.eye(4))  # the photo's frame: OpenCV axes, unit lengths of the object
     poses, registered, labels = poses_stage(pixels, view_camera, run, options, seed)
     chosen = [k for k in range(len(labels)) if registered[k]]
-    views = [v for v in views_of(pixels.rgb, pixels.labels, view_camera, options.side) if v.label in {labels[k] for k in chosen}]
+    normal = None if "normals" in options.without else pixels.normal
+    views = [v for v in views_of(pixels.rgb, pixels.labels, view_camera, options.side, normal) if v.label in {labels[k] for k in chosen}]
     poses = poses[chosen]
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
@@ -155,7 +157,7 @@ def poses_stage(pixels, camera: Camera, run, options: DuplicatesOptions, seed: i
     if run.done("poses"):
         saved = run_arrays(run, "poses", "poses")
         return saved["poses"], saved["registered"], saved["labels"]
-    views = views_of(pixels.rgb, pixels.labels, camera, COARSE)
+    views = views_of(pixels.rgb, pixels.labels, camera, COARSE, None if "normals" in options.without else pixels.normal)
     with run.stage("poses", title="poses of the instances") as stage:
         links = () if "matching" in options.without else matched(pixels, camera, run, options, seed)
         search = Search(rounds=options.search_rounds)

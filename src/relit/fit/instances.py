@@ -39,7 +39,8 @@ OBJECT_RADIUS = 0.8  # of the widest silhouette, in the unit frame
 @dataclass(frozen=True)
 class View:
     """One instance in its window of the photo. camera: of the window, its pose that of the photo. rgb: (h, w, 3) linear. mask: (h, w).
-    known: (h, w), 0 where another object hides or may hide it. seen: share of the outline that ends at known background."""
+    known: (h, w), 0 where another object hides or may hide it. seen: share of the outline that ends at known background. normal: (h, w, 3)
+    prior in the camera's axes, 0 where there is none, or None."""
 
     label: int
     camera: Camera
@@ -47,10 +48,11 @@ class View:
     mask: np.ndarray
     known: np.ndarray
     seen: float
+    normal: np.ndarray | None = None
 
 
-def views_of(rgb: np.ndarray, labels: np.ndarray, camera: Camera, side: int) -> list[View]:
-    """A view of each label > 0, in windows of at most `side` pixels. camera: of the photo, identity pose."""
+def views_of(rgb: np.ndarray, labels: np.ndarray, camera: Camera, side: int, normal: np.ndarray | None = None) -> list[View]:
+    """A view of each label > 0, in windows of at most `side` pixels. camera: of the photo, identity pose. normal: of the photo, or None."""
     out = []
     for label in np.unique(labels[labels > 0]):
         own = labels == label
@@ -68,20 +70,22 @@ def views_of(rgb: np.ndarray, labels: np.ndarray, camera: Camera, side: int) -> 
             seen *= 0.5  # the frame cuts it
         w, h = right - left, bottom - top
         c = replace(camera, width=w, height=h, cx=camera.cx - left, cy=camera.cy - top)
-        picture = rgb[window]
+        picture, prior = rgb[window], None if normal is None else normal[window] * mask[..., None]
         s = min(1.0, side / max(w, h))
         if s < 1:
             size = (max(8, round(w * s)), max(8, round(h * s)))
             picture, mask, known = (cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (picture, mask, known))
+            prior = None if prior is None else cv2.resize(prior, size, interpolation=cv2.INTER_AREA)
             c = c.resized(*size)
-        out.append(View(int(label), c, picture, mask, (known > 0.99).astype(np.float32), seen))
+        out.append(View(int(label), c, picture, mask, (known > 0.99).astype(np.float32), seen, prior))
     return out
 
 
 def pixel_bank(views: list[View], poses: np.ndarray) -> PixelBank:
     """The pixels of the views, with the virtual cameras at `poses`; unknown ones are never drawn."""
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-    bank = make_bank(cameras, [v.rgb for v in views], [v.mask for v in views])
+    normals = [v.normal for v in views] if any(v.normal is not None for v in views) else None
+    bank = make_bank(cameras, [v.rgb for v in views], [v.mask for v in views], normals)
     known = np.concatenate([v.known.ravel() for v in views]) > 0.5
     candidates = np.array(bank.candidates)
     bank.candidates = mi.UInt32(candidates[known[candidates]])
