@@ -125,6 +125,11 @@ def test_lobes_are_found_for_both_paints(shot, found):
         assert np.median(got["specular"][rows][paint]) == pytest.approx(np.median(true["specular"][rows][paint]), rel=0.2)
 
 
+def test_patches_lead_to_the_offset_too(shot):
+    model = fitted(shot, patches=0.3, steps=60, kin=False)
+    assert np.linalg.norm(np.array(model.offset)[:2] - scene.OFFSET[:2]) < 0.6 * np.linalg.norm(scene.OFFSET[:2])
+
+
 def test_fixed_offset_stays(shot):
     model = fitted(shot, steps=3, offset_rate=0.0, kin=False)
     np.testing.assert_array_equal(np.array(model.offset), 0)

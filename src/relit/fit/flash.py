@@ -52,8 +52,9 @@ class FlashOptions:
     shrunk until all together have no more. shadows: soft visibility in the last level of the volume pass.
     faces: of the mesh, about. texture: texels a side. surface_steps, points: steps of the surface pass, pixels per step.
     directions: of inter-reflection per pixel and estimate. bounces: of it. ior: index of refraction of the coat.
-    smooth: weight of the material's smoothness. dino: an ONNX file of a DINO network whose features tell which places are alike, or
-    `hub:OWNER/NAME/PATH` to fetch it; what the capture itself tells where empty. without: parts that are switched off, names of WITHOUT.
+    smooth: weight of the material's smoothness. patches: weight of PIR's pyramid and SSIM terms, none by default. dino: an ONNX file of a
+    DINO network whose features tell which places are alike, or `hub:OWNER/NAME/PATH` to fetch it; what the capture itself tells where empty.
+    without: parts that are switched off, names of WITHOUT.
     """
 
     levels: tuple[int, ...] = (96, 192)
@@ -69,6 +70,7 @@ class FlashOptions:
     bounces: int = 2
     ior: float = IOR
     smooth: float = 0.0003
+    patches: float = 0.0
     dino: str = ""
     without: tuple[str, ...] = ()
 
@@ -115,7 +117,8 @@ def surface_options(o: FlashOptions, saturated: float) -> FlashSurfaceOptions:
     directions = 0 if "interreflection" in o.without else o.directions
     share = {"smooth": o.smooth} if "features" not in o.without else {"smooth": 0.0}
     shadow = "shadow" not in o.without
-    return FlashSurfaceOptions(o.surface_steps, o.points, directions, o.bounces, shadow, saturated=saturated, **off, **share)
+    common = {"saturated": saturated, "patches": o.patches}
+    return FlashSurfaceOptions(o.surface_steps, o.points, directions, o.bounces, shadow, **common, **off, **share)
 
 
 def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> Asset:

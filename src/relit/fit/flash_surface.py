@@ -1,6 +1,6 @@
 """The surface pass of flash captures: rough-plastic textures, a normal map, and the flash itself, on a fixed mesh.
 
-Each step takes some thousand pixels of all photos, in small square patches. Direct light is exact; inter-reflection is estimated twice and
+Each step takes some thousand pixels of all photos. Direct light is exact; inter-reflection is estimated twice and
 independently, so that the product of the two residuals is unbiased for the squared error (rendering/transport_flash.py).
 """
 
@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.conventions import srgb_from_linear
+from relit.fit.flash_patches import draw_patches, pyramid_loss, ssim_loss
 from relit.fit.kinship import Kinship, share_evidence
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight
@@ -39,6 +40,7 @@ class FlashSurfaceOptions:
     (fit/kinship.py), taken every share_every steps; own: part of what a texel has to itself that is kept per step.
     slope_*: the normal map (see SurfaceOptions of fit/surface.py). offset_z: weight of |Δo_z|. alpha_range: of alpha beyond .5.
     saturated: linear value from which on a pixel is over-exposed.
+    patches: weight of the Gaussian-pyramid and SSIM terms of PIR Eq. 9; pixels are then drawn in patches (fit/flash_patches.py).
     """
 
     steps: int = 2000
@@ -69,6 +71,7 @@ class FlashSurfaceOptions:
     offset_z: float = 0.002
     alpha_range: float = 0.1
     saturated: float = 0.99
+    patches: float = 0.0
 
 
 @dataclass
@@ -106,7 +109,7 @@ def fit_flash_surface(
 
     def step(i: int) -> dict:
         decay = cosine_decay(i / o.steps, 0.03)
-        pixel = draw_pixels(bank, rng, o.points)
+        pixel = draw_patches(bank, rng, o.points) if o.patches > 0 else draw_pixels(bank, rng, o.points)
         dr.eval(pixel, rng)
         batch = batch_of(bank, pixel)
         points = first_hits(mesh, batch.o, batch.d)
@@ -135,6 +138,9 @@ def fit_flash_surface(
         e = min(1.5 * i / o.steps, 1.0)
         sigma = dr.opaque(mi.Float, o.robust[0] ** (1 - e) * o.robust[1] ** e)
         fit = robust_loss(a, b, batch.rgb, valid, calm, sigma, o.saturated)
+        if o.patches > 0:
+            alike = pyramid_loss(a, b, batch.rgb, dr.select(valid, calm, 0)) + ssim_loss(a, b, batch.rgb, valid)
+            fit += dr.opaque(mi.Float, o.patches) * alike
         bend = slope.x * points.t + slope.y * points.b
         prior = material_prior(model, plastic, points, near, valid, o) + slope_prior(field, bend, close, valid, o)
         offset_z = dr.abs(dr.gather(mi.Float, model.offset, mi.UInt32(2)))
