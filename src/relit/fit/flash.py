@@ -52,9 +52,9 @@ class FlashOptions:
     shrunk until all together have no more. shadows: soft visibility in the last level of the volume pass.
     faces: of the mesh, about. texture: texels a side. surface_steps, points: steps of the surface pass, pixels per step.
     directions: of inter-reflection per pixel and estimate. bounces: of it. ior: index of refraction of the coat.
-    smooth: weight of the material's smoothness. patches: weight of PIR's pyramid and SSIM terms, none by default. dino: an ONNX file of a
-    DINO network whose features tell which places are alike, or `hub:OWNER/NAME/PATH` to fetch it; what the capture itself tells where empty.
-    without: parts that are switched off, names of WITHOUT.
+    smooth: weight of the material's smoothness. patches: weight of PIR's pyramid and SSIM terms, none by default.
+    dino: an ONNX file of a DINO network whose features tell which places are alike, or `hub:OWNER/NAME/PATH` to fetch it; what the
+    capture itself tells where empty. without: parts that are switched off, names of WITHOUT.
     """
 
     levels: tuple[int, ...] = (96, 192)
