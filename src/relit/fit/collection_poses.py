@@ -42,6 +42,7 @@ from relit.scene import Camera
 PARTS = (0.6, 1.0, 0.3)  # of register.PARTS: under other lights a colour is worth less than what is dark and what is bright
 COARSE = (0, 6.0, 3.0)  # degrees; of refinements before the last
 HOPELESS = 0.8  # mean score of the first photos below which growth is given up
+ELSEWHERE = 0.012  # by which a pose far away must score better: sides that look alike differ by .01 from light alone
 HINT = 0.05  # weight of the hints' prior on scores in the first round, falling to 0
 SPREAD = 0.36  # root mean square radius of silhouettes, unit frame: the gauge of scale
 GREY = 0.3  # mean colour of every crop
@@ -201,7 +202,7 @@ def polish(crops: list[Crop], poses: np.ndarray, directions: np.ndarray, degrees
         found = search(crops, gallery, keep, rings=rings, prior=prior)
         own, height = refine(crops, poses, render, rings=rings, steps=(0, 1.5), parts=PARTS)
         other, scores = best_refined(crops, found, render, rings, keep, COARSE)
-        stays = height + 0.005 >= scores
+        stays = height + ELSEWHERE >= scores
         poses = np.where(stays[:, None, None], own, other)
         scores = np.maximum(height, scores)
         say(
