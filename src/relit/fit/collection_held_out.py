@@ -11,11 +11,11 @@ import numpy as np
 from relit.cameras.se3 import rotation_angle
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_photos import Shot, crops_of
-from relit.fit.collection_poses import COARSE, GREY, PARTS, Quiet, best_refined
+from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, Quiet, best_refined
 from relit.fit.collection_surface import fit_collection_surface, light_options, start_collection_surface
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import corrected, make_bank
-from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, refine, search, views_from, volume_render
+from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, near, refine, search, views_from, volume_render
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.lighting.per_photo import COLUMNS, ROWS
@@ -74,8 +74,10 @@ def find(shots: list[Shot], model: VolumeModel, degrees: float, options: Collect
     crops, hints = crops_of(shots), np.array([s.direction for s in shots])
     render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops, PARTS)
     gallery = make_gallery(render, views_from(directions_around(AGAIN, seed)), PARTS)
-    prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * (np.linalg.norm(hints, axis=1) > 0.5)[:, None, None]
-    return crops, rings, render, search(crops, gallery, options.keep, rings=rings, prior=prior)
+    hinted = np.linalg.norm(hints, axis=1) > 0.5
+    prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * hinted[:, None, None]
+    allowed = near(gallery, hints, degrees + SLACK) | ~hinted[:, None]
+    return crops, rings, render, search(crops, gallery, options.keep, rings=rings, prior=prior, allowed=allowed)
 
 
 def register(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int) -> list[Camera]:

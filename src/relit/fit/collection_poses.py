@@ -43,6 +43,7 @@ PARTS = (0.6, 1.0, 0.3)  # of register.PARTS: under other lights a colour is wor
 COARSE = (0, 6.0, 3.0)  # degrees; of refinements before the last
 HOPELESS = 0.8  # mean score of the first photos below which growth is given up
 ELSEWHERE = 0.012  # by which a pose far away must score better: sides that look alike differ by .01 from light alone
+SLACK = 15.0  # degrees that a photo may stand beyond what its hint allows, once the shape is known
 HINT = 0.05  # weight of the hints' prior on scores in the first round, falling to 0
 SPREAD = 0.36  # root mean square radius of silhouettes, unit frame: the gauge of scale
 GREY = 0.3  # mean colour of every crop
@@ -199,7 +200,8 @@ def polish(crops: list[Crop], poses: np.ndarray, directions: np.ndarray, degrees
         render = volume_render(replace(model, appearance=shade_plain))
         gallery = make_gallery(render, views_from(directions_around(500, seed + 200 + i)), PARTS)
         prior = 0.5 * HINT * hint_prior(gallery, directions, degrees, 45.0) * hinted[:, None, None]
-        found = search(crops, gallery, keep, rings=rings, prior=prior)
+        allowed = near(gallery, directions, degrees + SLACK) | ~hinted[:, None]
+        found = search(crops, gallery, keep, rings=rings, prior=prior, allowed=allowed)
         own, height = refine(crops, poses, render, rings=rings, steps=(0, 1.5), parts=PARTS)
         other, scores = best_refined(crops, found, render, rings, keep, COARSE)
         stays = height + ELSEWHERE >= scores
