@@ -160,7 +160,7 @@ def poses_stage(pixels, camera: Camera, run, options: DuplicatesOptions, seed: i
     views = views_of(pixels.rgb, pixels.labels, camera, COARSE, None if "normals" in options.without else pixels.normal)
     with run.stage("poses", title="poses of the instances") as stage:
         links = () if "matching" in options.without else matched(pixels, camera, run, options, seed)
-        search = Search(rounds=options.search_rounds)
+        search = Search(rounds=options.search_rounds, **({"descents": 0} if "refinement" in options.without else {}))
         try:
             poses, scores = place(views, search, seed=seed, links=links, say=run.say)
         except ValueError:
