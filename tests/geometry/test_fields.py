@@ -146,7 +146,7 @@ def test_atlas_falls_back(monkeypatch):
     import relit.geometry.atlas as atlas
 
     monkeypatch.setattr(atlas, "SCRIPT", "import time; time.sleep(60)")
-    mesh, how = unwrap(extract_mesh(ball(16, 0.6)), 256, seconds=0.5)
+    mesh, how = unwrap(extract_mesh(ball(16, 0.6)), 256, seconds=0.1)
     assert how == "cells" and mesh.uvs is not None
 
 

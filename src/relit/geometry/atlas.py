@@ -13,8 +13,14 @@ import numpy as np
 from relit.scene import Mesh
 
 XATLAS_FACES = 60_000  # above it xatlas takes minutes
+BUSY = 10  # a busy machine may take so many times longer by the clock than in processor time
 SCRIPT = """
 import sys, numpy as np, xatlas
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CPU, (int(sys.argv[3]), int(sys.argv[3]) + 5))
+except (ImportError, ValueError, OSError):
+    pass
 d = np.load(sys.argv[1], allow_pickle=False)
 atlas = xatlas.Atlas()
 atlas.add_mesh(d["vertices"], d["faces"], d["normals"])
@@ -26,11 +32,12 @@ np.savez(sys.argv[2], mapping=mapping, faces=faces, uvs=uvs)
 """
 
 
-def unwrap(mesh: Mesh, resolution: int, *, padding: int = 3, seconds: float = 60.0) -> tuple[Mesh, str]:
+def unwrap(mesh: Mesh, resolution: int, *, padding: int = 3, seconds: float = 90.0) -> tuple[Mesh, str]:
     """Give a mesh texture coordinates; vertices are doubled along seams. Returns the mesh and how it was done ('xatlas' or 'cells').
 
     resolution: texels a side that the padding refers to. xatlas can hang or crash on difficult meshes: it runs in a process of its
-    own for at most `seconds`, and a mesh that it does not manage gets an atlas of cells, two faces in each.
+    own for at most `seconds` of processor time (BUSY times that by the clock), and a mesh that it does not manage gets an atlas of cells,
+    two faces in each.
     """
     if len(mesh.faces) <= XATLAS_FACES:
         found = _xatlas(mesh, resolution, padding, seconds)
@@ -52,7 +59,8 @@ def _xatlas(mesh: Mesh, resolution: int, padding: int, seconds: float) -> Mesh |
             padding=padding,
         )
         try:
-            subprocess.run([sys.executable, "-c", SCRIPT, source, target], check=True, timeout=seconds, capture_output=True)
+            command = [sys.executable, "-c", SCRIPT, source, target, str(max(1, round(seconds)))]
+            subprocess.run(command, check=True, timeout=BUSY * seconds, capture_output=True)
             with np.load(target, allow_pickle=False) as d:
                 mapping, faces, uvs = d["mapping"].astype(np.int64), d["faces"].astype(np.int32), d["uvs"].astype(np.float32)
         except (subprocess.SubprocessError, OSError, KeyError, ValueError):
