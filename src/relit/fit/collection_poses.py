@@ -310,8 +310,8 @@ def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
     if score < HOPELESS:
         raise ValueError(f"from none of {len(tried)} photos could a shape be grown that others agree with (best score {score:.2f})")
     late = [min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2, 0.27, 0.37, 0.47, 0.57, 0.75, 1, 1, 1)]
-    poses, _ = grow(crops, best, late, seed, say, rings)
-    return settle(crops, poses, rings, keep, seed, say)
+    poses, scores = grow(crops, best, late, seed, say, rings)
+    return settle(crops, poses, scores, rings, keep, seed, say)
 
 
 def start_photos(crops: list[Crop], rings, count: int) -> list[int]:
@@ -327,9 +327,10 @@ def start_photos(crops: list[Crop], rings, count: int) -> list[int]:
     return chosen
 
 
-def settle(crops: list[Crop], poses: np.ndarray, rings, keep: int, seed: int, say, rounds: int = 3):
-    """A few rounds with all photos and no restriction on the viewpoints."""
-    scores = np.zeros(len(crops))
+def settle(crops: list[Crop], poses: np.ndarray, scores: np.ndarray, rings, keep: int, seed: int, say, rounds: int = 3):
+    """A few rounds with all photos and no restriction on the viewpoints; the best on average counts, be it the beginning: a handful of
+    photos is worse off without restriction."""
+    best = (float(scores.mean()), poses, scores)
     for i in range(rounds):
         model = coarse_model(crops, gauge(crops, poses), 48, 120, 0.12, seed + 100 + i)
         render = volume_render(model)
@@ -337,4 +338,6 @@ def settle(crops: list[Crop], poses: np.ndarray, rings, keep: int, seed: int, sa
         found = search(crops, gallery, keep, rings=rings)
         poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1)
         say(f"settling, round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
-    return gauge(crops, poses), scores
+        if scores.mean() > best[0]:
+            best = (float(scores.mean()), poses, scores)
+    return gauge(crops, best[1]), best[2]
