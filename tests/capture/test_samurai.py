@@ -96,7 +96,7 @@ def test_angles_of_ners(tmp_path):
 
 def test_a_held_out_photo_that_is_not_there_is_refused(folder):
     (folder / "held_out.json").write_text(json.dumps({"frames": ["77.png"]}))
-    with pytest.raises(UserError, match="77.png"):
+    with pytest.raises(UserError, match=r"77.png"):
         open_capture(folder)
 
 
