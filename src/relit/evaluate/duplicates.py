@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from relit.cameras.se3 import nearest_rotation, rotation_angle
-from relit.conventions import move_points, scale_of, similarity, world_from_cv_camera
+from relit.conventions import move_points, similarity, world_from_cv_camera
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.scene import Asset, Camera, Ground
 
 VISIBLE = 0.25  # share of an instance that must be seen for it to count among those to be registered
 SAMPLES = 30_000
+PHOTO_SIDE = 480  # pixels of the re-rendered photo, longer side
 MASKED = f"pixels of the objects (truth coverage >= {m.MASK}) in novel views of the whole pile; a pixel without a prediction is black"
 DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
     "rotation_median": (
@@ -54,7 +55,11 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
         "radii",
         "mean of the two mean distances between points of both whole surfaces after a similarity (ICP), in radii of the true object",
     ),
-    "photo_psnr": ("dB", "the photo re-rendered with its own camera and light, sRGB-encoded, over the pixels of registered instances"),
+    "photo_psnr": (
+        "dB",
+        f"the photo, its longer side shrunk to {PHOTO_SIDE} pixels, re-rendered with its own camera and light, sRGB-encoded, over pixels "
+        "that lie wholly in registered instances",
+    ),
 }
 
 
@@ -196,6 +201,7 @@ def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
 def photo_figure(asset: Asset, capture: Path, *, spp: int = 64, seed: int = 0) -> float:
     """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr)."""
     from relit.capture.sfd import open_duplicates, recognise
+    from relit.evaluate.photos import shrunk
     from relit.rendering.mitsuba_scene import build_scene, render
     from relit.rendering.pile import build_pile
 
@@ -204,10 +210,13 @@ def photo_figure(asset: Asset, capture: Path, *, spp: int = 64, seed: int = 0) -
         raise UserError("the capture is no photo of duplicates", fix=f"give the folder that the run was made from: {capture}")
     camera = asset.cameras[0][1]
     pixels = open_duplicates(source, focal=camera.fx).photos[0].load()
+    own = np.isin(pixels.labels, [i.label for i in asset.instances if i.registered])
+    factor = min(1.0, PHOTO_SIDE / max(camera.width, camera.height))
+    camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    rgb, where = shrunk(pixels.rgb, camera), shrunk(own.astype(np.float32), camera) >= m.MASK
     pile = build_pile(asset.mesh, asset.material, [i.world_from_object for i in asset.instances if i.registered], asset.ground)
     picture = render(build_scene(pile.mesh, pile.material, np.eye(4), asset.environment), camera, spp=spp, seed=seed)
-    where = np.isin(pixels.labels, [i.label for i in asset.instances if i.registered])
-    return m.psnr(m.encode(picture[..., :3]), m.encode(pixels.rgb), where)
+    return m.psnr(m.encode(picture[..., :3]), m.encode(rgb), where)
 
 
 def read_cameras(file: Path) -> list[tuple[str, Camera]]:
@@ -278,17 +287,17 @@ def scene_alignment(poses: dict, true_poses: dict, photo: Camera, true_points: n
     turn = object_turn(poses, true_poses)
     middle = (true_points.min(0) + true_points.max(0)) / 2
     own = (asset.mesh.vertices.min(0) + asset.mesh.vertices.max(0)) / 2
-    ratios = [
-        np.linalg.norm(move_points(true_poses[k], middle) - photo.centre) / np.linalg.norm(move_points(poses[k], own) - photo.centre)
-        for k in poses
-        if k in true_poses
-    ]
     size = np.ptp(asset.mesh.vertices, axis=0).max() / np.ptp(true_points, axis=0).max()
     frame = similarity(turn, own - size * turn @ middle, size)
     frame = icp(true_points[::10], asset.mesh.vertices.astype(np.float64), frame)
-    scale = float(np.median(ratios))
-    sizes = [scale_of(true_poses[k]) / (scale_of(poses[k]) * scale_of(frame)) for k in poses if k in true_poses]
-    return float(np.sqrt(scale * np.median(sizes))), frame
+    # distances tell the scale far better than sizes: a per cent of the distance is a tenth of an object
+    ratios = [
+        np.linalg.norm(move_points(true_poses[k], middle) - photo.centre)
+        / np.linalg.norm(move_points(poses[k] @ frame, middle) - photo.centre)
+        for k in poses
+        if k in true_poses
+    ]
+    return float(np.median(ratios)), frame
 
 
 def icp(source: np.ndarray, target: np.ndarray, start: np.ndarray, rounds: int = 30) -> np.ndarray:
