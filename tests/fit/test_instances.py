@@ -11,7 +11,7 @@ import pytest
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_growth import Growth, grow, linked_poses
-from relit.fit.instance_search import Guesses, crops_of, first_pairs, trusted
+from relit.fit.instance_search import Guesses, Search, crops_of, first_pairs, place, trusted
 from relit.fit.instances import carved, first_pose, fit_model, frame_scale, inflated, pixel_bank, views_of
 from relit.fit.pile_scene import find_ground
 from relit.fit.register import crop_rings
@@ -151,6 +151,21 @@ def test_an_instance_joins_those_that_stand_and_poses_wait_for_the_shape():
     values = carved(views, truth, 24, 0.0)
     assert np.allclose(fit_model(views, truth, values, 3, refine_cameras=0.01, hold=3)[1], truth)
     assert not np.allclose(fit_model(views, truth, values, 3, refine_cameras=0.01, hold=1)[1], truth, atol=1e-4)
+
+
+def test_poses_are_found_from_silhouettes_and_colours_alone():
+    views, truth = painted([0, 20, 40])
+    small = {"nodes": 24, "steps": 8, "viewpoints": 200}
+    o = Search(**small, models=1, starts=1, descents=1, convincing=2.0, growth=Growth(**small, keep=1))
+    said = []
+    poses, scores = place(views, o, say=said.append)
+    for k in (1, 2):
+        turn, true = (p[k][:3, :3].T @ p[0][:3, :3] for p in (poses, truth))
+        assert rotation_angle(turn.T @ true) < 20
+    assert scores.shape == (3,) and scores.min() > 0.7
+    assert any("uncertain" in text for text in said)
+    alone, score = place(views[:1], o)
+    assert alone.shape == (1, 4, 4) and score.tolist() == [1.0]
 
 
 def test_instances_with_low_scores_are_not_trusted():

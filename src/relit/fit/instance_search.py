@@ -207,6 +207,8 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
                 best = skill, poses, scores, parts
     if best is None:
         raise ValueError("no set of poses agrees with the silhouettes")
-    _, poses, scores, parts = best
+    skill, poses, scores, parts = best
+    if skill < o.convincing:
+        say(f"note: the poses are uncertain, {skill:.2f} above chance where {o.convincing:.2f} convinces: is the object nearly symmetric?")
     poses, scores = settle(views, crops, rings[parts], poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
     return descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
