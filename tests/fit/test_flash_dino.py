@@ -1,6 +1,5 @@
 """Features of a network on the surface: an ONNX file of the right signature, made here byte by byte, and how its tokens reach places."""
 
-
 import numpy as np
 import pytest
 
