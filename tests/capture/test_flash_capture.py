@@ -77,7 +77,7 @@ def test_broken_camera_files(made, tmp_path, change, message):
 def test_light_files(tmp_path):
     assert read_light(tmp_path) == (None, None)
     (tmp_path / "light_offset.txt").write_text("0.1 0.2")
-    with pytest.raises(UserError, match="light_offset.txt does not hold 3 numbers"):
+    with pytest.raises(UserError, match=r"light_offset\.txt does not hold 3 numbers"):
         read_light(tmp_path)
 
 
@@ -88,11 +88,15 @@ def test_missing_light_is_told_when_it_is_needed(made, tmp_path):
 
     shutil.copytree(made, tmp_path / "c")
     (tmp_path / "c" / "light.txt").unlink()
-    with pytest.raises(UserError, match="light.txt is missing"):
+    with pytest.raises(UserError, match=r"light\.txt is missing"):
         load_flash_truth(tmp_path / "c")
 
 
-@pytest.mark.parametrize("wrong", [{"views": 1}, {"offset": (0, 0)}, {"offset": (3, 0, 0)}, {"relights": ["x.hdr"]}, {"nodes": ["nothing"]}])
+@pytest.mark.parametrize(
+    "wrong", [{"views": 1}, {"offset": (0, 0)}, {"offset": (3, 0, 0)}, {"relights": ["x.hdr"]}, {"nodes": ["nothing"]}]
+)
 def test_wrong_settings(made, tmp_path, wrong):
     with pytest.raises(UserError):
-        synthesize_flash(made.parent / "pawn.glb", (), tmp_path / "out", **{"views": 3, "test_views": 1, "resolution": 16, "spp": 1, **wrong})
+        synthesize_flash(
+            made.parent / "pawn.glb", (), tmp_path / "out", **{"views": 3, "test_views": 1, "resolution": 16, "spp": 1, **wrong}
+        )
