@@ -22,11 +22,11 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from relit.conventions import similarity
-from relit.fit.pixels import PixelBank, RayBatch, camera_rows, corrected, make_bank, rays_through
+from relit.fit.pixels import PixelBank, corrected, make_bank
+from relit.fit.register import volume_render
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
-from relit.rendering.march import march, sphere_interval
 from relit.rendering.shade_world import shade_albedo, shade_world, start_world_light
 from relit.scene import Camera
 
@@ -222,26 +222,4 @@ def moved_poses(bank: PixelBank, views: list[View], poses: np.ndarray) -> np.nda
 
 def albedo_render(model: VolumeModel):
     """Renders the model's colours without light on black, and its opacity: `fit.register.Render`."""
-
-    def render(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
-        side, rgb, alpha = cameras[0].width, [], []
-        inv_s, dt = dr.opaque(mi.Float, model.inv_s), dr.opaque(mi.Float, 0.9 * model.grid.h)
-        each = max(1, (1 << 20) // side**2)
-        for first in range(0, len(cameras), each):
-            some = cameras[first : first + each]
-            index = dr.arange(mi.UInt32, len(some) * side * side)
-            view, pixel = index // (side * side), index % (side * side)
-            rows = mi.Float(camera_rows(some))
-            o, d = rays_through(rows, view, mi.Float(pixel % side) + 0.5, mi.Float(pixel // side) + 0.5)
-            t0, t1 = sphere_interval(o, d)
-            dr.eval(o, d, t0, t1)
-            m = march(model.grid, o, d, t0, t1, inv_s, dt)
-            colour, _ = shade_albedo(m, RayBatch(o, d, None, None, view, pixel), rows, model.reflections)
-            inside = t1 > t0
-            colour, opacity = dr.select(inside, colour, 0), dr.select(inside, m.opacity, 0)
-            dr.eval(colour, opacity)
-            rgb.append(np.array(colour).T.reshape(-1, side, side, 3))
-            alpha.append(np.array(opacity).reshape(-1, side, side))
-        return np.concatenate(rgb), np.concatenate(alpha)
-
-    return render
+    return volume_render(replace(model, appearance=shade_albedo))
