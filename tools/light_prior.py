@@ -1,10 +1,15 @@
-"""Learn the prior of per-photo lights from HDRIs: `python tools/light_prior.py FOLDER`, writes src/relit/lighting/light_prior.npz.
+"""Learn the prior of per-photo lights: `python tools/light_prior.py FOLDER [--without NAME,...] [--network FOLDER] [--draws 600]`.
 
-Every .hdr and .exr in the folder is averaged down to 16 x 32 texels, brought to mean luminance 1, turned about the vertical in 32 steps and
-mirrored; the file holds the mean of the log radiance and its first principal components times their standard deviations.
+Writes src/relit/lighting/light_prior.npz. Every .hdr and .exr in the folder whose stem does not begin with one of the names is averaged
+down to 16 x 32 texels, brought to mean luminance 1, turned about the vertical in 32 steps and mirrored; with a Neural-PIL network so many
+lights drawn from its codes join them, each under four turns. The file holds the mean of the log radiance and its first principal
+components times their standard deviations.
+
+What is shipped was learnt without the six HDRIs that light the suite `collection`: `python tools/light_prior.py ENVMAPS --without
+adams_place,empty_warehouse,forest_slope,immenstadter,kiara,lebombo --network NEURAL_PIL`.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import cv2
@@ -12,29 +17,51 @@ import numpy as np
 
 from relit.conventions import environment_solid_angles, luminance
 from relit.images import read_image
+from relit.lighting.neural_pil import load_neural_pil
 from relit.lighting.per_photo import COLUMNS, ROWS
 
-COMPONENTS = 40
+COMPONENTS = 64
+TURNS = 4  # of a drawn light
+WEIGHT = environment_solid_angles(ROWS, COLUMNS) / (4 * np.pi)
 
 
-def main(folder: Path) -> None:
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in (".hdr", ".exr"))
-    weight = environment_solid_angles(ROWS, COLUMNS) / (4 * np.pi)
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--without", default="")
+    parser.add_argument("--network", type=Path)
+    parser.add_argument("--draws", type=int, default=600)
+    args = parser.parse_args()
+    without = tuple(n for n in args.without.split(",") if n)
+    files = sorted(f for f in args.folder.iterdir() if f.suffix.lower() in (".hdr", ".exr"))
+    files = [f for f in files if not (without and f.stem.startswith(without))]
     rows = []
     for file in files:
-        small = cv2.resize(read_image(file).rgb, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
-        small = np.log(np.maximum(small / (luminance(small) * weight).sum(), 1e-3))
-        for turned in (np.roll(m, k, axis=1) for m in (small, small[:, ::-1]) for k in range(COLUMNS)):
-            rows.append(turned.ravel())
+        small = level(cv2.resize(read_image(file).rgb, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA))
+        rows += [np.roll(m, k, axis=1).ravel() for m in (small, small[:, ::-1]) for k in range(COLUMNS)]
+    rng = np.random.default_rng(0)
+    if args.network:
+        network = load_neural_pil(args.network)
+        for row in network.log_maps(rng.normal(size=(args.draws, network.size)).astype(np.float32)):
+            small = level(np.exp(row).reshape(ROWS, COLUMNS, 3))
+            rows += [np.roll(small, int(k), axis=1).ravel() for k in rng.integers(0, COLUMNS, TURNS)]
     rows = np.array(rows)
-    mean = rows.mean(0)
+    mean = rows.mean(0).reshape(ROWS, COLUMNS, 3).mean(1, keepdims=True)  # no azimuth is likelier than another
+    mean = np.repeat(mean, COLUMNS, 1).ravel()
     _, s, vt = np.linalg.svd(rows - mean, full_matrices=False)
     kept = float((s[:COMPONENTS] ** 2).sum() / (s**2).sum())
     basis = vt[:COMPONENTS] * (s[:COMPONENTS, None] / np.sqrt(len(rows)))
     out = Path(__file__).parents[1] / "src" / "relit" / "lighting" / "light_prior.npz"
     np.savez_compressed(out, mean=mean.astype(np.float16), basis=basis.astype(np.float16))
-    print(f"{len(files)} HDRIs, {COMPONENTS} components hold {kept:.0%} of the variance, {out.stat().st_size / 1024:.0f} KiB: {out}")
+    drawn = args.draws if args.network else 0
+    size = out.stat().st_size / 1024
+    print(f"{len(files)} HDRIs, {drawn} drawn lights; {COMPONENTS} components hold {kept:.0%} of the variance; {size:.0f} KiB: {out}")
+
+
+def level(radiance: np.ndarray) -> np.ndarray:
+    """Log radiance of a map brought to mean luminance 1."""
+    return np.log(np.maximum(radiance / (luminance(radiance) * WEIGHT).sum(), 1e-3))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

@@ -25,7 +25,7 @@ from relit.fit.collection_held_out import held_out_stage, look_again
 from relit.fit.collection_options import CollectionOptions, options_for
 from relit.fit.collection_photos import Shot, crops_of, load_shots
 from relit.fit.collection_poses import GREY, agreement, find_poses, schedule_of
-from relit.fit.collection_surface import fit_collection_surface, light_options, posterior, start_collection_surface
+from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, posterior, start_collection_surface
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
@@ -52,6 +52,7 @@ COST = {"draft": (150.0, 1.2e9), "standard": (700.0, 2.0e9), "high": (2500.0, 3.
 
 def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0) -> Asset:
     """Run all stages of the recipe in the run folder; stages that are done are read back."""
+    light_family(options)  # a network that cannot be read is said before anything is searched
     shots, held, degrees = load_shots(capture, options, run)
     tints = np.array([s.tint for s in shots])
     cameras, weights = pose_stage(shots, degrees, run, options, seed)
@@ -215,7 +216,7 @@ def surface_stage(bank: PixelBank, mesh: Mesh, albedo, tints, run, options: Coll
         scale = ALBEDO_START / float((albedo * areas[:, None]).sum() / areas.sum() / 3)
         start = np.clip(fill_gutters(interpolate(albedo, mesh.faces, face, bary), known) * scale, 0.02, 0.95)
         material = start_material(o.texture, start, o.roughness_start, 0.05)
-        model = start_collection_surface(material, tints, ALBEDO_START)
+        model = start_collection_surface(material, tints, ALBEDO_START, light_family(options))
         fit_collection_surface(bank, TraceableMesh(mesh, albedo * scale), model, o, light_options(options), stage, seed)
         base, roughness, metallic = pictures(model.material)
         silent = int((model.weights < 0.3).sum())

@@ -12,7 +12,7 @@ from relit.cameras.se3 import rotation_angle
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_photos import Shot, crops_of
 from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, Quiet, best_refined
-from relit.fit.collection_surface import fit_collection_surface, light_options, start_collection_surface
+from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, start_collection_surface
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import corrected, make_bank
 from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, near, refine, search, views_from, volume_render
@@ -46,7 +46,7 @@ def held_out_stage(held: list[Shot], model: VolumeModel, mesh, albedo, maps, cam
             material.metallic = mi.Float(maps["metallic"].astype(np.float32).ravel())
             n = maps["normal"]
             material.slope = mi.Float((n[..., :2] / np.maximum(n[..., 2:], 0.1)).astype(np.float32).ravel())
-            lit = start_collection_surface(material, np.array([s.tint for s in shots]), ALBEDO_START)
+            lit = start_collection_surface(material, np.array([s.tint for s in shots]), ALBEDO_START, light_family(options))
             areas = vertex_areas(mesh)
             scale = ALBEDO_START / float((albedo * areas[:, None]).sum() / areas.sum() / 3)
             o = SurfaceOptions(options.frozen_steps, options.points, options.directions, size)

@@ -17,7 +17,8 @@ class CollectionOptions:
     the registration, on average, and least_agreement: share of photos that find their place in a model of the others, below which the
     poses are taken for wrong. levels, level_steps, rays: of the volume pass.
     refine_cameras: step of the camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass.
-    frozen_steps: of the fit of held-out photos. without: what an ablation switches off.
+    frozen_steps: of the fit of held-out photos. light_network: folder of Neural-PIL's network, which then takes the place of the shipped
+    prior of lights. without: what an ablation switches off.
     """
 
     side: int = 400
@@ -39,6 +40,7 @@ class CollectionOptions:
     points: int = 4096
     directions: int = 32
     frozen_steps: int = 150
+    light_network: str = ""
     without: tuple[str, ...] = ()
 
     @property

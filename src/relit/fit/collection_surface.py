@@ -17,7 +17,8 @@ from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
 from relit.fit.surface import SurfaceOptions, material_prior, neighbours, parsimony
-from relit.lighting.per_photo import TEXELS, PhotoLights, light_prior, log_lights
+from relit.lighting.neural_pil import load_neural_pil
+from relit.lighting.per_photo import TEXELS, LightComponents, PhotoLights, light_prior, log_lights, mean_level
 from relit.materials.field import MaterialField, material_at, project, slope_at
 from relit.rendering.transport import TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 
@@ -49,20 +50,24 @@ class CollectionSurface:
     coefficients: np.ndarray
     gains: np.ndarray
     weights: np.ndarray
+    family: object  # of lights: what makes maps of coefficients
     losses: list[float] = field(default_factory=list)
 
     def lights(self) -> np.ndarray:
         """(V, TEXELS * 3) log radiance."""
-        return log_lights(self.coefficients, self.gains)
+        return log_lights(self.coefficients, self.gains, self.family)
 
 
-def start_collection_surface(material: MaterialField, tints: np.ndarray, albedo: float) -> CollectionSurface:
+def light_family(options: CollectionOptions):
+    """The lights that photos may stand under: the network at `light_network`, or what is shipped."""
+    return load_neural_pil(options.light_network) if options.light_network else LightComponents(*light_prior())
+
+
+def start_collection_surface(material: MaterialField, tints: np.ndarray, albedo: float, family=None) -> CollectionSurface:
     """tints: (V, 3) mean radiance of the object in each photo; albedo: mean base colour. A light of radiance L shows albedo * L."""
-    k = light_prior()[1].shape[0]
-    gains = np.log(np.maximum(tints, 1e-3) / albedo).astype(np.float32)
-    even = np.exp(light_prior()[0]).reshape(TEXELS, 3).mean(0)
-    gains = gains - np.log(even)
-    return CollectionSurface(material, np.zeros((len(tints), k), np.float32), gains, np.ones(len(tints), np.float32))
+    family = LightComponents(*light_prior()) if family is None else family
+    gains = np.log(np.maximum(tints, 1e-3) / albedo / mean_level(family)).astype(np.float32)
+    return CollectionSurface(material, np.zeros((len(tints), family.size), np.float32), gains, np.ones(len(tints), np.float32), family)
 
 
 def posterior(losses: np.ndarray, history: list[float]) -> np.ndarray:
@@ -98,8 +103,7 @@ def fit_collection_surface(
     adam_s = Adam(3)
     ratio = mi.Float(np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2))
     lights = PhotoLights(dr.exp(mi.Float(model.lights().ravel())), views)
-    basis = light_prior()[1]
-    even = np.exp(light_prior()[0]).reshape(TEXELS, 3).mean(0)
+    even = mean_level(model.family)
     level = mi.Float((np.exp(model.gains) * even).astype(np.float32).ravel())  # what arrives on average: for what blocks a direction
     running = np.zeros(views)
 
@@ -157,7 +161,7 @@ def fit_collection_surface(
             project(material)
             dr.eval(material.colour, material.metallic, material.slope)
         g = np.array(gradients[0]).reshape(views, TEXELS * 3)
-        gc = g @ basis.T + light.prior / views * model.coefficients
+        gc = model.family.pull_back(model.coefficients, g) + light.prior / views * model.coefficients
         gg = g.reshape(views, TEXELS, 3).sum(1)
         if not frozen:
             chroma = model.gains - model.gains.mean(1, keepdims=True)

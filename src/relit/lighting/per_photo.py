@@ -6,6 +6,7 @@ about the vertical (tools/light_prior.py makes the file that is read here). gain
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any
@@ -28,10 +29,37 @@ def light_prior() -> tuple[np.ndarray, np.ndarray]:
         return data["mean"].astype(np.float32), data["basis"].astype(np.float32)
 
 
-def log_lights(coefficients: np.ndarray, gains: np.ndarray, prior=None) -> np.ndarray:
-    """(V, TEXELS * 3) log radiance of coefficients (V, K) and log gains (V, 3)."""
-    mean, basis = light_prior() if prior is None else prior
-    return (mean + coefficients @ basis + np.tile(gains, (1, TEXELS))).astype(np.float32)
+@dataclass(frozen=True)
+class LightComponents:
+    """The shipped family of lights. mean: (TEXELS * 3,) log radiance, basis: (K, TEXELS * 3). `neural_pil.NeuralPil` is another one, with
+    the same methods."""
+
+    mean: np.ndarray
+    basis: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Numbers of a photo."""
+        return len(self.basis)
+
+    def log_maps(self, numbers: np.ndarray) -> np.ndarray:
+        """(V, TEXELS * 3) log radiance of the maps of numbers (V, size), before any gain."""
+        return (self.mean + numbers @ self.basis).astype(np.float32)
+
+    def pull_back(self, numbers: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Gradient with respect to numbers (V, size) of a loss whose gradient with respect to `log_maps` is (V, TEXELS * 3)."""
+        return gradient @ self.basis.T
+
+
+def log_lights(numbers: np.ndarray, gains: np.ndarray, family=None) -> np.ndarray:
+    """(V, TEXELS * 3) log radiance of numbers (V, K) and log gains (V, 3). family: of lights, by default the shipped one."""
+    family = LightComponents(*light_prior()) if family is None else family
+    return (family.log_maps(numbers) + np.tile(gains, (1, TEXELS))).astype(np.float32)
+
+
+def mean_level(family) -> np.ndarray:
+    """(3,) mean radiance of the family's middle light."""
+    return np.exp(family.log_maps(np.zeros((1, family.size), np.float32))).reshape(TEXELS, 3).mean(0)
 
 
 class PhotoLights:
