@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from relit.capture import open_capture
-from relit.capture.sfd import _run_lengths, _uncompressed
+from relit.capture.labels import run_lengths, uncompressed
 from relit.errors import UserError
 
 W, H = 160, 96
@@ -140,7 +140,7 @@ def test_cutouts(tmp_path):
         open_capture(path)
 
 
-def test_coco_polygons_and_run_lengths(tmp_path):
+def test_coco_polygons_andrun_lengths(tmp_path):
     path = photo(tmp_path)
     mask = (labels_of() == 100).astype(np.uint8)
     flat = mask.T.ravel()
@@ -161,7 +161,7 @@ def test_coco_polygons_and_run_lengths(tmp_path):
         open_capture(path)
 
 
-def test_compressed_run_lengths():
+def test_compressedrun_lengths():
     def compressed(runs):  # COCO's rleToString
         out = ""
         for i, run in enumerate(runs):
@@ -174,6 +174,6 @@ def test_compressed_run_lengths():
         return out
 
     runs = [3, 40, 2, 55, 1, 700, 5, 9]
-    assert _uncompressed(compressed(runs)) == runs
-    mask = _run_lengths({"size": [5, sum(runs) // 5], "counts": compressed(runs)})
+    assert uncompressed(compressed(runs)) == runs
+    mask = run_lengths({"size": [5, sum(runs) // 5], "counts": compressed(runs)})
     assert mask.T.ravel()[:3].sum() == 0 and mask.T.ravel()[3:43].all()

@@ -121,15 +121,17 @@ def match_pair(a: Features, b: Features, sweep: bool = True) -> Link | None:
     return Link(i, j, at * float(STEP)) if len(i) >= LEAST else None
 
 
-def verified(link: Link, a: Features, b: Features, camera: Camera, error: float) -> Link | None:
-    """The matches that one essential matrix of the photo's intrinsics explains, or None. error: pixels."""
+def verified(link: Link, a: Features, b: Features, camera: Camera, error: float, second: Camera | None = None) -> Link | None:
+    """The matches that one essential matrix of the photo's intrinsics explains, or None. error: pixels. second: the camera of b where it
+    is from another photo."""
     pycolmap = load_pycolmap()
 
     options = pycolmap.TwoViewGeometryOptions(min_num_inliers=LEAST, detect_watermark=False, compute_relative_pose=True)
     options.ransac.max_error, options.ransac.random_seed, options.ransac.max_num_trials = error, 0, 3000
-    c = colmap_camera(camera)
     matches = np.stack([link.a, link.b], 1).astype(np.uint32)
-    geometry = pycolmap.estimate_calibrated_two_view_geometry(c, a.points, c, b.points, matches, options)
+    geometry = pycolmap.estimate_calibrated_two_view_geometry(
+        colmap_camera(camera), a.points, colmap_camera(second or camera), b.points, matches, options
+    )
     inliers = np.asarray(geometry.inlier_matches, int)
     if len(inliers) < LEAST:
         return None

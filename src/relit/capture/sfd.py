@@ -1,10 +1,13 @@
-"""One photo of several identical objects and where each of them is: SfD's folders, a photo with a label image, cut-outs, COCO.
+"""Photos of several identical objects and where each of them is: SfD's folders, photos with label images, cut-outs, COCO, BOP.
 
 SfD          transforms_train.json and train/000_rgb.png, train/000_instance_seg.png (or raw/000_rgb.png, raw/000_instance_seg.png)
 labels       NAME_labels.png, NAME_instance_seg.png or NAME_seg.png beside the photo NAME.*: one grey level or colour for each object,
              black for the rest
-cut-outs     cutouts/*.png beside the photo: RGBA pictures of the photo's size, one for each object
+cut-outs     cutouts/*.png beside the photo (of several photos: cutouts/NAME/*.png): RGBA pictures of the photo's size, one for each object
 COCO         a .json with `images` and `annotations` (polygons or run lengths) beside the photo
+BOP          a scene's folder: scene_camera.json, scene_gt.json, rgb/, mask_visib/ or mask/; of several objects the commonest
+
+Several photos with labels in one folder are photos of one pile: nothing stirs between them, and labels need not agree.
 """
 
 from __future__ import annotations
@@ -18,28 +21,30 @@ import cv2
 import numpy as np
 
 from relit.capture.frames import pose_from, read_json
+from relit.capture.labels import BOP_TRUTH, bop_object, checked_labels, read_labels
 from relit.capture.photo import Decoder
 from relit.conventions import world_from_cv_camera
 from relit.errors import UserError
-from relit.images import EXTENSIONS, read_header
+from relit.images import EXTENSIONS, Header, read_header
 from relit.scene import Camera, Capture, Photo, Pixels
 
 SUFFIXES = ("_instance_seg", "_labels", "_instances", "_seg")
 SFD_NORMALS = "_normal_pretrain.png"  # SfD's: y up, z towards the camera
 CUTOUTS = ("cutouts", "cut-outs", "instances")
-LEAST_SIDE = 24  # pixels; smaller objects carry no pose
-MOST = 1000  # objects
 FOCAL_GUESS = 1.2  # of the longer side, where neither the user nor the file tells
+MOST_PHOTOS = 12  # of one pile; of more, so many evenly spread
 
 
 @dataclass(frozen=True)
 class Source:
-    """What was found: the photo, where its labels are (a label image, a folder of cut-outs, a COCO file), and the file with the camera."""
+    """What was found: the photo, where its labels are (a label image, a folder of cut-outs, a COCO or BOP file), and the file with the
+    cameras. more: (photo, labels) of the other photos of the same pile."""
 
     root: Path
     photo: Path
     labels: Path
     cameras: Path | None = None
+    more: tuple[tuple[Path, Path], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -59,22 +64,33 @@ class Labelled:
 
 
 def recognise(path: Path) -> Source | None:
-    """The photo and its labels, or None where `path` is no photo of duplicates."""
+    """The photos and their labels, or None where `path` is no photo of duplicates."""
     if path.is_file():
         labels = _labels_of(path) if path.suffix.lower() in EXTENSIONS else None
         return None if labels is None else Source(path.parent, path, labels, _cameras(path.parent))
     if not path.is_dir():
         return None
+    if (path / BOP_TRUTH).is_file() and (path / "rgb").is_dir():
+        photos = [f for f in sorted((path / "rgb").iterdir()) if f.suffix.lower() in EXTENSIONS]
+        return _source(path, [(f, path / BOP_TRUTH) for f in photos], path / "scene_camera.json") if photos else None
     for folder in (path / "train", path / "raw", path):
         if folder.is_dir():
-            for photo in sorted(folder.iterdir()):
-                if photo.suffix.lower() in EXTENSIONS and not _is_side_file(photo) and (labels := _labels_of(photo)) is not None:
-                    return Source(path, photo, labels, _cameras(path))
+            found = [(f, labels) for f in sorted(folder.iterdir()) if _is_photo(f) and (labels := _labels_of(f)) is not None]
+            if found:
+                return _source(path, found, _cameras(path))
     return None
 
 
-def _is_side_file(file: Path) -> bool:
-    return file.stem.endswith((*SUFFIXES, "_mask", "_normal", "_normal_pretrain", "_depth"))
+def _source(root: Path, found: list[tuple[Path, Path]], cameras: Path | None) -> Source:
+    if len({labels for _, labels in found}) == 1 and found[0][1].is_dir():
+        found = found[:1]  # one folder of cut-outs is one photo's
+    if len(found) > MOST_PHOTOS:
+        found = [found[k] for k in np.linspace(0, len(found) - 1, MOST_PHOTOS).round().astype(int)]
+    return Source(root, *found[0], cameras, tuple(found[1:]))
+
+
+def _is_photo(file: Path) -> bool:
+    return file.suffix.lower() in EXTENSIONS and not file.stem.endswith((*SUFFIXES, "_mask", "_normal", "_normal_pretrain", "_depth"))
 
 
 def _cameras(root: Path) -> Path | None:
@@ -88,31 +104,53 @@ def _labels_of(photo: Path) -> Path | None:
             if (file := photo.parent / f"{stem}{suffix}{end}").is_file():
                 return file
     for name in CUTOUTS:
-        if (photo.parent / name).is_dir() and any((photo.parent / name).glob("*.png")):
-            return photo.parent / name
+        for folder in (photo.parent / name / stem, photo.parent / name):
+            if folder.is_dir() and any(folder.glob("*.png")):
+                return folder
     for file in sorted(photo.parent.glob("*.json")):
-        if file.stat().st_size < 64 << 20 and _is_coco(file):
+        if file.stat().st_size < 64 << 20 and _is_coco(file, photo):
             return file
     return None
 
 
-def _is_coco(file: Path) -> bool:
+def _is_coco(file: Path, photo: Path) -> bool:
+    """Whether the file is COCO's and speaks of the photo (or of one picture only)."""
     try:
         data = json.loads(file.read_text(encoding="utf-8-sig"))
     except (ValueError, OSError, RecursionError):
         return False
-    return isinstance(data, dict) and isinstance(data.get("annotations"), list) and isinstance(data.get("images"), list)
+    if not isinstance(data, dict) or not isinstance(data.get("annotations"), list) or not isinstance(data.get("images"), list):
+        return False
+    names = {Path(str(i.get("file_name", ""))).name for i in data["images"] if isinstance(i, dict)}
+    others = [f for f in photo.parent.iterdir() if f.name in names]
+    return photo.name in names or not others
 
 
 def open_duplicates(source: Source, *, focal: float | None = None, max_side: int | None = None) -> Capture:
-    """The capture: one photo with its camera and labels. focal: pixels of the photo as stored, or None. Raises UserError (exit code 3)."""
-    header = read_header(source.photo)
-    w, h, notes = header.width, header.height, []
-    labels, dropped = checked_labels(read_labels(source.labels, source.photo, (h, w)), source.labels)
-    notes += dropped
-    pose, known = np.eye(4), None
-    if source.cameras is not None:
-        pose, known = _camera(source.cameras, w)
+    """The capture: each photo with its camera and labels. focal: pixels of the photo as stored, or None. Raises UserError (exit code 3)."""
+    notes: list[str] = []
+    photos = []
+    for path, labels in ((source.photo, source.labels), *source.more):
+        header = read_header(path)
+        own, dropped = checked_labels(read_labels(labels, path, (header.height, header.width)), labels)
+        named = f"{path.name}: " if source.more else ""
+        notes += [named + note for note in (*dropped, f"{len(np.unique(own[own > 0]))} objects in {labels.name}")]
+        photos.append(labelled_photo(source, path, header, own, focal, max_side, notes))
+    if source.labels.name == BOP_TRUTH:
+        notes.append(f"the objects are those with obj_id {bop_object(read_json(source.labels))}, the commonest of the scene")
+    if source.more:
+        notes.append(f"{len(photos)} photos of one pile: nothing must stir between them")
+    return Capture(source.root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates")
+
+
+def labelled_photo(
+    source: Source, path: Path, header: Header, labels: np.ndarray, focal: float | None, max_side: int | None, notes: list[str]
+) -> Photo:
+    """One photo with its camera and its labels (H, W); what was assumed goes to `notes`."""
+    w, h = header.width, header.height
+    pose, known, middle = np.eye(4), None, (w / 2, h / 2)
+    if source.cameras is not None and source.cameras.is_file():
+        pose, known, middle = (_bop_camera if source.cameras.name == "scene_camera.json" else _camera)(source.cameras, path, w, h)
     if focal is None and known is None:
         focal = header.focal
         if focal is None:
@@ -123,182 +161,55 @@ def open_duplicates(source: Source, *, focal: float | None = None, max_side: int
     f = float(focal if focal is not None else known)
     scale = min(1.0, (max_side or max(w, h)) / max(w, h))
     size = (max(1, round(w * scale)), max(1, round(h * scale)))
-    camera = Camera(w, h, f, f, w / 2, h / 2, pose).resized(*size)
+    camera = Camera(w, h, f, f, *middle, pose).resized(*size)
     labels = labels if scale == 1 else cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
-    name = source.photo.relative_to(source.root).as_posix()
-    stem = source.photo.stem.removesuffix("_rgb")
-    beside = (source.photo.with_name(stem + end) for end in ("_normal.png", "_normal.exr", SFD_NORMALS))
-    normal = next((p for p in beside if p.is_file()), None)
+    stem = path.stem.removesuffix("_rgb")
+    normal = next((p for end in ("_normal.png", "_normal.exr", SFD_NORMALS) if (p := path.with_name(stem + end)).is_file()), None)
     upward = normal is not None and normal.name.endswith(SFD_NORMALS)
-    load = Labelled(Decoder(source.photo, size, normal=normal, orientation=header.orientation), labels.astype(np.int32), upward)
+    load = Labelled(Decoder(path, size, normal=normal, orientation=header.orientation), labels.astype(np.int32), upward)
     if normal is not None:
         notes.append(f"normal priors in {normal.name}")
-    notes.append(f"{len(np.unique(labels[labels > 0]))} objects in {source.labels.name}")
-    photo = Photo(name, load, *size, camera=camera, focal_hint=header.focal)
-    return Capture(source.root, "duplicates", (photo,), notes=tuple(notes), kind="duplicates")
+    return Photo(path.relative_to(source.root).as_posix(), load, *size, camera=camera, focal_hint=header.focal)
 
 
-def _camera(file: Path, width: int) -> tuple[np.ndarray, float | None]:
-    """(world_from_camera, focal in pixels or None) of the first frame. SfD writes the focal length as text."""
+def _camera(file: Path, photo: Path, width: int, height: int) -> tuple[np.ndarray, float | None, tuple[float, float]]:
+    """(world_from_camera, focal in pixels or None, principal point) of the photo's frame, or of the first where none is named like it. SfD
+    writes the focal length as text."""
     data = read_json(file)
-    frames = data.get("frames")
-    first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
-    pose = world_from_cv_camera(pose_from(first["transform_matrix"], "the camera", file)) if "transform_matrix" in first else np.eye(4)
-    for key in ("focal", "fl_x", "camera_angle_x"):
-        value = first.get(key, data.get(key))
+    frames = [f for f in data.get("frames") or [] if isinstance(f, dict)] if isinstance(data.get("frames"), list) else []
+    stem = photo.stem.removesuffix("_rgb")
+    frame = next((f for f in frames if Path(str(f.get("file_path", ""))).stem.removesuffix("_rgb") == stem), frames[0] if frames else {})
+    pose = world_from_cv_camera(pose_from(frame["transform_matrix"], "the camera", file)) if "transform_matrix" in frame else np.eye(4)
+
+    def number(key: str) -> float | None:
+        value = frame.get(key, data.get(key))
         if value is None:
-            continue
+            return None
         try:
-            number = float(value)
+            out = float(value)
         except (TypeError, ValueError):
-            number = -1.0
-        if not 0 < number < 1e6:
-            raise UserError(f"'{key}' is no focal length: {value!r}", fix=f"write a number of pixels: {file}")
-        if key == "camera_angle_x":
-            return pose, width / (2 * np.tan(number / 2))
-        given = first.get("w", data.get("w"))  # the size that the focal length is for, where the file tells it
-        return pose, number * (width / float(given) if given else 1.0)
-    return pose, None
+            out = -1.0
+        if not 0 < out < 1e6:
+            raise UserError(f"'{key}' is no focal length, size or principal point: {value!r}", fix=f"write a number of pixels: {file}")
+        return out
+
+    sx, sy = (size / given if (given := number(key)) else 1.0 for key, size in (("w", width), ("h", height)))
+    cx, cy = number("cx"), number("cy")
+    middle = (width / 2 if cx is None else cx * sx, height / 2 if cy is None else cy * sy)
+    for key in ("focal", "fl_x", "camera_angle_x"):
+        value = number(key)
+        if value is not None:
+            return pose, width / (2 * np.tan(value / 2)) if key == "camera_angle_x" else value * sx, middle
+    return pose, None, middle
 
 
-# ---------------------------------------------------------------- labels
-
-
-def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W) int32 numbers of the objects, 0 for the rest. Raises UserError when the labels do not fit the photo."""
-    if source.is_dir():
-        return _from_cutouts(source, shape)
-    if source.suffix.lower() == ".json":
-        return _from_coco(source, photo, shape)
-    data = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
-    if data is None:
-        raise UserError("the label image cannot be read", "it is damaged or no picture", f"write it again: {source}")
-    labels = _numbers(data)
-    if labels.shape != shape:
-        if abs(labels.shape[1] / labels.shape[0] - shape[1] / shape[0]) > 0.01 * shape[1] / shape[0]:
-            raise UserError(
-                f"the labels have another shape than the photo: {labels.shape[1]} x {labels.shape[0]} and {shape[1]} x {shape[0]} pixels",
-                "they belong to another photo, or one of them was cropped or turned",
-                f"make them from this photo: {source}",
-            )
-        labels = cv2.resize(labels, shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return labels
-
-
-def _numbers(data: np.ndarray) -> np.ndarray:
-    """Label numbers of a picture: its grey values, or a number for each colour; black is 0."""
-    if data.ndim == 3:
-        data = data[..., :3].astype(np.int64)
-        grey = (data[..., 0] == data[..., 1]).all() and (data[..., 1] == data[..., 2]).all()
-        data = data[..., 0] if grey else data[..., 2] * 65536 + data[..., 1] * 256 + data[..., 0]
-    return data.astype(np.int32)
-
-
-def _from_cutouts(folder: Path, shape: tuple[int, int]) -> np.ndarray:
-    labels = np.zeros(shape, np.int32)
-    for k, file in enumerate(sorted(folder.glob("*.png")), 1):
-        data = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        if data is None or data.ndim != 3 or data.shape[2] != 4 or data.shape[:2] != shape:
-            have = (
-                "unreadable"
-                if data is None
-                else f"{data.shape[1]} x {data.shape[0]} pixels, {1 if data.ndim == 2 else data.shape[2]} channels"
-            )
-            raise UserError(
-                f"a cut-out does not fit the photo: {have}; the photo has {shape[1]} x {shape[0]} pixels",
-                "where the object stands in the photo would be unknown",
-                f"write cut-outs as RGBA at the photo's size, clear off the object: {file}",
-            )
-        labels[data[..., 3] > 127] = k
-    return labels
-
-
-def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
-    data = read_json(file)
-    names = {i.get("id"): i for i in data["images"] if isinstance(i, dict)}
-    entry = next((i for i in names.values() if Path(str(i.get("file_name", ""))).name == photo.name), None)
-    if entry is None and len(names) == 1:
-        entry = next(iter(names.values()))
-    if entry is None:
-        raise UserError(f"the annotations do not name the photo {photo.name}", fix=f"check `images`: {file}")
-    sx, sy = shape[1] / float(entry.get("width", shape[1])), shape[0] / float(entry.get("height", shape[0]))
-    labels, k = np.zeros(shape, np.int32), 0
-    for a in data["annotations"]:
-        if not isinstance(a, dict) or a.get("image_id") != entry.get("id"):
-            continue
-        k += 1
-        s = a.get("segmentation")
-        try:
-            if isinstance(s, dict):
-                mask = _run_lengths(s)
-                labels[cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = k
-            else:
-                polygons = [np.round(np.array(p, np.float64).reshape(-1, 2) * (sx, sy)).astype(np.int32) for p in s]
-                cv2.fillPoly(labels, polygons, k)
-        except (TypeError, ValueError, KeyError, OverflowError, cv2.error) as error:
-            raise UserError(f"annotation {k} has no usable segmentation", str(error), f"polygons or run lengths: {file}") from None
-    return labels
-
-
-def _run_lengths(s: dict) -> np.ndarray:
-    """A COCO mask (H, W) uint8: column-major runs of 0 and 1 in turn, as numbers or in COCO's compressed text."""
-    h, w = (int(x) for x in s["size"])
-    if not 0 < h * w <= 1 << 28:
-        raise ValueError("the size makes no sense")
-    counts = s["counts"]
-    if isinstance(counts, str):
-        counts = _uncompressed(counts)
-    counts = np.asarray(counts, np.int64)
-    if (counts < 0).any() or counts.sum() != h * w:
-        raise ValueError("the runs do not fill the picture")
-    return np.repeat(np.arange(len(counts)) % 2, counts).astype(np.uint8).reshape(w, h).T
-
-
-def _uncompressed(text: str) -> list[int]:
-    """Runs of COCO's text form: six bits a letter, the sixth says that more follow, from the third run on differences."""
-    out, i = [], 0
-    while i < len(text):
-        value, shift, more = 0, 0, True
-        while more:
-            c = ord(text[i]) - 48
-            value |= (c & 31) << shift
-            more, i, shift = bool(c & 32), i + 1, shift + 5
-            if not more and c & 16:
-                value |= -1 << shift
-        out.append(value + out[-2] if len(out) > 2 else value)
-    return out
-
-
-def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[str]]:
-    """Labels without objects that are too small, and notes about them. Raises UserError when fewer than one object is left."""
-    values, index, areas = np.unique(labels, return_inverse=True, return_counts=True)
-    index, notes = index.reshape(labels.shape), []
-    objects = values > 0
-    if not objects.any():
-        raise UserError("the labels hold no object: they are black all over", fix=f"give each object a grey level or colour: {source}")
-    large = objects & (areas >= LEAST_SIDE**2 / 4)
-    if large.sum() > MOST or (objects.sum() > 3 * MOST and large.sum() == 0):
-        raise UserError(
-            f"the label image holds {int(objects.sum())} values", "it is a photograph, not labels", f"one value per object: {source}"
-        )
-    typical = np.median(areas[large]) if large.any() else 0
-    keep = large & (areas >= 0.02 * typical)
-    boxes = [np.nonzero(index == k) for k in np.flatnonzero(keep)]
-    for k, (y, x) in zip(np.flatnonzero(keep), boxes, strict=True):
-        if max(np.ptp(x), np.ptp(y)) + 1 < LEAST_SIDE:
-            keep[k] = False
-    gone = int((objects & ~keep).sum())
-    if not keep.any():
-        raise UserError(
-            f"every object is smaller than {LEAST_SIDE} pixels", "so few pixels carry no pose", f"take a larger photo: {source}"
-        )
-    if gone:
-        notes.append(f"{gone} labels cover less than {LEAST_SIDE} pixels, or next to nothing beside the others, and are left out")
-    if keep.sum() == 1:
-        notes.append("there is only one object: nothing but its front can be known from one photo")
-    border = np.unique(np.concatenate([index[0], index[-1], index[:, 0], index[:, -1]]))
-    cut = [int(k) for k in border if keep[k]]
-    if cut:
-        notes.append(f"{len(cut)} objects are cut by the photo's border")
-    out = np.where(objects & ~keep, -1, np.where(keep, values, 0)).astype(np.int32)
-    return out[index], notes
+def _bop_camera(file: Path, photo: Path, width: int, height: int) -> tuple[np.ndarray, float | None, tuple[float, float]]:
+    """As `_camera`, from BOP's cam_K; the world is the camera's frame (millimetres do not matter)."""
+    try:
+        k = np.array(read_json(file)[str(int(photo.stem))]["cam_K"], np.float64).reshape(3, 3)
+        if not (np.isfinite(k).all() and k[0, 0] > 0):
+            raise ValueError("cam_K makes no sense")
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError("scene_camera.json is not as BOP writes it", f"{type(error).__name__}: {error}", f"see: {file}") from None
+    # BOP counts pixel centres as whole numbers
+    return np.eye(4), float((k[0, 0] + k[1, 1]) / 2), (float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)

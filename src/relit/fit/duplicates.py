@@ -23,7 +23,7 @@ from relit.errors import EXIT_FAILED, UserError, did_you_mean
 from relit.fit.instance_search import Search, place
 from relit.fit.instances import COARSE, View, carved, move_poses, moved_poses, pixel_bank, views_of
 from relit.fit.multiview import run_arrays, vertex_areas
-from relit.fit.pile_scene import find_ground, ground_colour, photo_bank, scene_mesh
+from relit.fit.pile_scene import find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
@@ -262,6 +262,9 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
             for k, p in enumerate(poses)
         ]
         plane = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, poses)
+        if len(plane) and rate > 0:
+            poses, plane, count = set_down(mesh.vertices, poses, plane)
+            run.say(f"{count} instances stand on the ground and were moved along their lines of sight onto it")
         if len(plane) == 0:
             run.say("note: no ground was found that the instances stand on; nothing but they themselves casts shadows")
         parts = {
@@ -283,7 +286,7 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
 
 def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
     off = {"metallic_binary": 0.0, "metallic_sparse": 0.0} if "metal" in o.without else {}
-    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **off)
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, scale_power=1.0, **off)
 
 
 def surface_stage(pixels, camera: Camera, views, mesh: Mesh, parts, run, options: DuplicatesOptions, seed: int) -> dict[str, np.ndarray]:
@@ -306,13 +309,19 @@ def surface_stage(pixels, camera: Camera, views, mesh: Mesh, parts, run, options
         model = start_surface(start, known, level, o)
         fit_surface(bank, TraceableMesh(whole, radiance), model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)
+        environment = model.environment.image()
+        ground = ground_level
+        if len(parts["plane"]):
+            up = turn @ parts["plane"][1]
+            ground = ground_reflectance(environment, up, ground_level)
+            environment = light_below(environment, up, ground_level)
         maps = {
             "base_color": fill_gutters(base, known),
             "roughness": fill_gutters(roughness, known),
             "metallic": fill_gutters(metallic, known),
             "normal": normal_map(model.material),
-            "environment": model.environment.image(),
-            "ground_colour": ground_level / max(level / 0.4, 1e-6),
+            "environment": environment,
+            "ground_colour": ground,
         }
         stage.save("maps", **maps)
     return maps
@@ -344,7 +353,7 @@ def assemble(photo, mesh: Mesh, maps, parts, labels: list[int], chosen: list[int
     if len(plane):
         point = move_points(world_from_photo, plane[0])
         reach = max(np.linalg.norm(m[:3, 3] - point) for m in world_from_object) + 1.0
-        ground = Ground(point, up, 4 * float(reach), np.clip(maps["ground_colour"], 0.02, 0.95))
+        ground = Ground(point, up, 4 * float(reach), maps["ground_colour"])
     material = Material(maps["base_color"], maps["roughness"], maps["metallic"], normal=maps["normal"])
     cameras = ((photo.name, photo.camera),)
     return Asset(placed, material, world_from_object[0], maps["environment"], cameras, {}, None, instances=tuple(instances), ground=ground)

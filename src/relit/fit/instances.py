@@ -33,6 +33,7 @@ from relit.scene import Camera
 COARSE = 160  # pixels, longer side of a window while poses are searched
 MARGIN = 0.15  # of a window around its instance, of its size
 ACROSS = 50  # degrees from which another view bounds what this one leaves open in depth
+ANOTHER_PHOTO = 1 << 24  # labels are smaller: 24 bits of colour
 OBJECT_RADIUS = 0.8  # of the widest silhouette, in the unit frame
 
 
@@ -40,7 +41,8 @@ OBJECT_RADIUS = 0.8  # of the widest silhouette, in the unit frame
 class View:
     """One instance in its window of the photo. camera: of the window, its pose that of the photo. rgb: (h, w, 3) linear. mask: (h, w).
     known: (h, w), 0 where another object hides or may hide it. seen: share of the outline that ends at known background. normal: (h, w, 3)
-    prior in the camera's axes, 0 where there is none, or None."""
+    prior in the camera's axes, 0 where there is none, or None. photo: number of the photo that it is from; the camera's pose is that
+    photo's own frame."""
 
     label: int
     camera: Camera
@@ -49,10 +51,19 @@ class View:
     known: np.ndarray
     seen: float
     normal: np.ndarray | None = None
+    photo: int = 0
+
+    @property
+    def key(self) -> int:
+        """Names it among those of all photos; of the first photo it is the label."""
+        return self.label + self.photo * ANOTHER_PHOTO
 
 
-def views_of(rgb: np.ndarray, labels: np.ndarray, camera: Camera, side: int, normal: np.ndarray | None = None) -> list[View]:
-    """A view of each label > 0, in windows of at most `side` pixels. camera: of the photo, identity pose. normal: of the photo, or None."""
+def views_of(
+    rgb: np.ndarray, labels: np.ndarray, camera: Camera, side: int, normal: np.ndarray | None = None, photo: int = 0
+) -> list[View]:
+    """A view of each label > 0, in windows of at most `side` pixels. camera: of the photo, identity pose. normal: of the photo, or None.
+    photo: its number."""
     out = []
     for label in np.unique(labels[labels > 0]):
         own = labels == label
@@ -77,7 +88,7 @@ def views_of(rgb: np.ndarray, labels: np.ndarray, camera: Camera, side: int, nor
             picture, mask, known = (cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (picture, mask, known))
             prior = None if prior is None else cv2.resize(prior, size, interpolation=cv2.INTER_AREA)
             c = c.resized(*size)
-        out.append(View(int(label), c, picture, mask, (known > 0.99).astype(np.float32), seen, prior))
+        out.append(View(int(label), c, picture, mask, (known > 0.99).astype(np.float32), seen, prior, photo))
     return out
 
 

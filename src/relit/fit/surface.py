@@ -30,15 +30,15 @@ class SurfaceOptions:
     """steps, points (pixels per step), directions (per point). texture: texels a side. light: rows of the environment (twice as many
     columns).
 
-    colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step;
-    exchange_rate: of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of the steps over
-    which colour_rate rises from a twentieth. roughness_start: first roughness. smooth_roughness, smooth_metallic, smooth_colour:
-    weights of differences between similar neighbours, up to similarity_reach (unit frame) apart and similarity_width in base colour;
-    smooth_shade: power of `brightness` in smooth_colour. metallic_binary, metallic_sparse: of m (1 - m) and of m. bright: of base
-    colour beyond WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma. parsimony,
-    parsimony_width, parsimony_share: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which
-    it moves. slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its
-    optimiser (see `Adam`), so that noise does not move it at full rate.
+    colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step; exchange_rate:
+    of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of the steps over which colour_rate
+    rises from a twentieth. roughness_start: first roughness. smooth_roughness, smooth_metallic, smooth_colour: weights of differences
+    between similar neighbours, up to similarity_reach (unit frame) apart and similarity_width in base colour; smooth_shade: power of
+    `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary, metallic_sparse: of m (1 - m) and of m. bright: of base
+    colour beyond WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma. parsimony, parsimony_width,
+    parsimony_share: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves.
+    slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser
+    (see `Adam`), so that noise does not move it at full rate.
     """
 
     steps: int = 700
@@ -65,6 +65,7 @@ class SurfaceOptions:
     bright: float = 0.3
     light_smooth: float = 0.002
     light_neutral: float = 2e-4
+    scale_power: float = 0.5
     parsimony: float = 0.02
     parsimony_width: float = 0.1
     parsimony_share: float = 0.0
@@ -214,23 +215,24 @@ def brightness(rgb, base, valid, power: float):
     return dr.minimum(arriving / dr.maximum(mean, 1e-6), 2) ** power
 
 
-def common_scale(surface, valid):
-    """Factor on the base colours of the valid points in priors: (ALBEDO_START / their mean) ** 0.5 for each channel (Color3f of width 1),
+def common_scale(surface, valid, power: float = 0.5):
+    """Factor on the base colours of the valid points in priors: (ALBEDO_START / their mean) ** power for each channel (Color3f of width 1),
     with its gradient.
 
     Differences themselves shrink when everything darkens, and the light would brighten without end; relative differences shrink when a
     grey veil is laid over everything, and the light would dim. In between, as differences of display values do, they pull neither way.
-    One factor for all channels would let the least visible ones go dark, under a tinted light.
+    One factor for all channels would let the least visible ones go dark, under a tinted light. power: 1 is right where each texel stands
+    in many places and a veil would show (a photo of duplicates).
     """
     w = dr.select(valid, mi.Float(1), 0)
-    return mi.Color3f(*[dr.sqrt(ALBEDO_START / dr.maximum(weighted_mean(c, w), 1e-3)) for c in surface.base])
+    return mi.Color3f(*[(ALBEDO_START / dr.maximum(weighted_mean(c, w), 1e-3)) ** power for c in surface.base])
 
 
 def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing):
     """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour should share
     roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float)."""
     other = material_at(material, near.uv, near.valid)
-    level = common_scale(surface, valid)
+    level = common_scale(surface, valid, options.scale_power)
     step = (other.base - surface.base) * level
     difference = dr.detach(step)
     alike = dr.exp(-dr.squared_norm(mi.Vector3f(difference)) / (2 * options.similarity_width**2))
@@ -253,7 +255,7 @@ def parsimony(material: MaterialField, surface, uv, valid, shift, options: Surfa
     the partner of a point is in the batch."""
     n = dr.width(uv)
     partner = (dr.arange(mi.UInt32, n) + shift) % n
-    level = common_scale(surface, valid)
+    level = common_scale(surface, valid, options.scale_power)
     uv, valid = dr.gather(mi.Point2f, uv, partner), valid & dr.gather(mi.Bool, valid, partner)
     other = material_at(material, uv, valid)
     shown = lambda c: dr.maximum(c * level, 1e-3) ** (1 / 2.2)  # noqa: E731

@@ -55,13 +55,17 @@ def shading(n, learnt):
     return dr.exp(mi.Color3f(*logs))
 
 
-def shade_world(m: Marched, rays, cameras, learnt):
-    """The appearance itself: see `fit.volume.VolumeModel.appearance`."""
+def shade_world(m: Marched, rays, cameras, learnt, turns=None):
+    """The appearance itself: see `fit.volume.VolumeModel.appearance`. turns: Float, 9 for each view, the rotation (by rows) from its photo's
+    axes to those of the light, where views come from several photos; None where they come from one."""
     F = m.features
     n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
     d = rays.d
     r = d - 2 * dr.dot(d, n) * n
     turned, mirrored = in_photo(cameras, rays.view, n), in_photo(cameras, rays.view, r)
+    if turns is not None:
+        k = [dr.gather(mi.Vector3f, turns, rays.view * 3 + j) for j in range(3)]
+        turned, mirrored = (mi.Vector3f(*[dr.dot(row, v) for row in k]) for v in (turned, mirrored))
     mirrored = mi.Vector3f(mirrored.x, dr.clip(mirrored.y, -0.9999, 0.9999), mirrored.z)
     e = dr.exp(lookup_latlong(learnt, ROWS, COLUMNS, mirrored))
     x = rays.o + d * (m.depth / dr.maximum(m.opacity, 0.05))

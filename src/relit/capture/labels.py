@@ -1,0 +1,184 @@
+"""Which pixel of a photo belongs to which object: label images, cut-outs, COCO annotations, BOP's masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from relit.capture.frames import read_json
+from relit.errors import UserError
+
+LEAST_SIDE = 24  # pixels; smaller objects carry no pose
+MOST = 1000  # objects
+BOP_TRUTH = "scene_gt.json"
+
+
+def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) int32 numbers of the objects, 0 for the rest. Raises UserError when the labels do not fit the photo."""
+    if source.name == BOP_TRUTH:
+        return _from_bop(source, photo, shape)
+    if source.is_dir():
+        return _from_cutouts(source, shape)
+    if source.suffix.lower() == ".json":
+        return _from_coco(source, photo, shape)
+    data = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
+    if data is None:
+        raise UserError("the label image cannot be read", "it is damaged or no picture", f"write it again: {source}")
+    labels = _numbers(data)
+    if labels.shape != shape:
+        if abs(labels.shape[1] / labels.shape[0] - shape[1] / shape[0]) > 0.01 * shape[1] / shape[0]:
+            raise UserError(
+                f"the labels have another shape than the photo: {labels.shape[1]} x {labels.shape[0]} and {shape[1]} x {shape[0]} pixels",
+                "they belong to another photo, or one of them was cropped or turned",
+                f"make them from this photo: {source}",
+            )
+        labels = cv2.resize(labels, shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return labels
+
+
+def _numbers(data: np.ndarray) -> np.ndarray:
+    """Label numbers of a picture: its grey values, or a number for each colour; black is 0."""
+    if data.ndim == 3:
+        data = data[..., :3].astype(np.int64)
+        grey = (data[..., 0] == data[..., 1]).all() and (data[..., 1] == data[..., 2]).all()
+        data = data[..., 0] if grey else data[..., 2] * 65536 + data[..., 1] * 256 + data[..., 0]
+    return data.astype(np.int32)
+
+
+def _from_cutouts(folder: Path, shape: tuple[int, int]) -> np.ndarray:
+    labels = np.zeros(shape, np.int32)
+    for k, file in enumerate(sorted(folder.glob("*.png")), 1):
+        data = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if data is None or data.ndim != 3 or data.shape[2] != 4 or data.shape[:2] != shape:
+            have = (
+                "unreadable"
+                if data is None
+                else f"{data.shape[1]} x {data.shape[0]} pixels, {1 if data.ndim == 2 else data.shape[2]} channels"
+            )
+            raise UserError(
+                f"a cut-out does not fit the photo: {have}; the photo has {shape[1]} x {shape[0]} pixels",
+                "where the object stands in the photo would be unknown",
+                f"write cut-outs as RGBA at the photo's size, clear off the object: {file}",
+            )
+        labels[data[..., 3] > 127] = k
+    return labels
+
+
+def bop_object(truth: dict) -> int:
+    """The obj_id of which the first picture of BOP's scene_gt.json shows the most instances."""
+    first = truth[min(truth, key=int)]
+    ids = [int(entry["obj_id"]) for entry in first]
+    return max(sorted(set(ids)), key=ids.count)
+
+
+def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Instances of the scene's commonest object, from mask_visib/ (what can be seen of each) or mask/."""
+    try:
+        truth = read_json(source)
+        chosen, entries = bop_object(truth), truth[str(int(photo.stem))]
+        labels = np.zeros(shape, np.int32)
+        for k, entry in enumerate(entries):
+            if int(entry["obj_id"]) != chosen:
+                continue
+            name = f"{photo.stem}_{k:06d}.png"
+            file = next((f for f in (source.parent / "mask_visib" / name, source.parent / "mask" / name) if f.is_file()), None)
+            mask = None if file is None else cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            if mask is None or mask.shape != shape:
+                raise UserError(f"no usable mask {name}", "each instance needs its mask at the photo's size", f"see: {source.parent}")
+            labels[mask > 127] = k + 1
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UserError("scene_gt.json is not as BOP writes it", f"{type(error).__name__}: {error}", f"see: {source}") from None
+    return labels
+
+
+def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
+    data = read_json(file)
+    names = {i.get("id"): i for i in data["images"] if isinstance(i, dict)}
+    entry = next((i for i in names.values() if Path(str(i.get("file_name", ""))).name == photo.name), None)
+    if entry is None and len(names) == 1:
+        entry = next(iter(names.values()))
+    if entry is None:
+        raise UserError(f"the annotations do not name the photo {photo.name}", fix=f"check `images`: {file}")
+    sx, sy = shape[1] / float(entry.get("width", shape[1])), shape[0] / float(entry.get("height", shape[0]))
+    labels, k = np.zeros(shape, np.int32), 0
+    for a in data["annotations"]:
+        if not isinstance(a, dict) or a.get("image_id") != entry.get("id"):
+            continue
+        k += 1
+        s = a.get("segmentation")
+        try:
+            if isinstance(s, dict):
+                mask = run_lengths(s)
+                labels[cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = k
+            else:
+                polygons = [np.round(np.array(p, np.float64).reshape(-1, 2) * (sx, sy)).astype(np.int32) for p in s]
+                cv2.fillPoly(labels, polygons, k)
+        except (TypeError, ValueError, KeyError, OverflowError, cv2.error) as error:
+            raise UserError(f"annotation {k} has no usable segmentation", str(error), f"polygons or run lengths: {file}") from None
+    return labels
+
+
+def run_lengths(s: dict) -> np.ndarray:
+    """A COCO mask (H, W) uint8: column-major runs of 0 and 1 in turn, as numbers or in COCO's compressed text."""
+    h, w = (int(x) for x in s["size"])
+    if not 0 < h * w <= 1 << 28:
+        raise ValueError("the size makes no sense")
+    counts = s["counts"]
+    if isinstance(counts, str):
+        counts = uncompressed(counts)
+    counts = np.asarray(counts, np.int64)
+    if (counts < 0).any() or counts.sum() != h * w:
+        raise ValueError("the runs do not fill the picture")
+    return np.repeat(np.arange(len(counts)) % 2, counts).astype(np.uint8).reshape(w, h).T
+
+
+def uncompressed(text: str) -> list[int]:
+    """Runs of COCO's text form: six bits a letter, the sixth says that more follow, from the third run on differences."""
+    out, i = [], 0
+    while i < len(text):
+        value, shift, more = 0, 0, True
+        while more:
+            c = ord(text[i]) - 48
+            value |= (c & 31) << shift
+            more, i, shift = bool(c & 32), i + 1, shift + 5
+            if not more and c & 16:
+                value |= -1 << shift
+        out.append(value + out[-2] if len(out) > 2 else value)
+    return out
+
+
+def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[str]]:
+    """Labels without objects that are too small, and notes about them. Raises UserError when fewer than one object is left."""
+    values, index, areas = np.unique(labels, return_inverse=True, return_counts=True)
+    index, notes = index.reshape(labels.shape), []
+    objects = values > 0
+    if not objects.any():
+        raise UserError("the labels hold no object: they are black all over", fix=f"give each object a grey level or colour: {source}")
+    large = objects & (areas >= LEAST_SIDE**2 / 4)
+    if large.sum() > MOST or (objects.sum() > 3 * MOST and large.sum() == 0):
+        raise UserError(
+            f"the label image holds {int(objects.sum())} values", "it is a photograph, not labels", f"one value per object: {source}"
+        )
+    typical = np.median(areas[large]) if large.any() else 0
+    keep = large & (areas >= 0.02 * typical)
+    boxes = [np.nonzero(index == k) for k in np.flatnonzero(keep)]
+    for k, (y, x) in zip(np.flatnonzero(keep), boxes, strict=True):
+        if max(np.ptp(x), np.ptp(y)) + 1 < LEAST_SIDE:
+            keep[k] = False
+    gone = int((objects & ~keep).sum())
+    if not keep.any():
+        raise UserError(
+            f"every object is smaller than {LEAST_SIDE} pixels", "so few pixels carry no pose", f"take a larger photo: {source}"
+        )
+    if gone:
+        notes.append(f"{gone} labels cover less than {LEAST_SIDE} pixels, or next to nothing beside the others, and are left out")
+    if keep.sum() == 1:
+        notes.append("there is only one object: nothing but its front can be known from one photo")
+    border = np.unique(np.concatenate([index[0], index[-1], index[:, 0], index[:, -1]]))
+    cut = [int(k) for k in border if keep[k]]
+    if cut:
+        notes.append(f"{len(cut)} objects are cut by the photo's border")
+    out = np.where(objects & ~keep, -1, np.where(keep, values, 0)).astype(np.int32)
+    return out[index], notes

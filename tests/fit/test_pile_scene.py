@@ -1,0 +1,68 @@
+"""Objects on their ground, and what the ground says of the light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relit.cameras.se3 import exp_so3
+from relit.conventions import environment_directions, move_points, similarity
+from relit.fit.pile_scene import SETTLED, ground_reflectance, light_below, set_down
+
+UP = np.array([0.0, -np.sin(0.9), -np.cos(0.9)])  # of the ground, in the photo's frame
+
+
+def ball(count=600):
+    rng = np.random.default_rng(0)
+    v = rng.normal(size=(count, 3))
+    return 0.8 * v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def standing(vertices, count, seed=1):
+    """Poses photo_from_object of objects that touch the plane through (0, 0, 10)."""
+    rng, out = np.random.default_rng(seed), []
+    for _ in range(count):
+        turn = exp_so3(rng.normal(size=3))
+        low = (vertices @ turn.T @ UP).min()
+        side = rng.uniform(-3, 3, 3)
+        side -= UP * (side @ UP)
+        out.append(similarity(turn, np.array([0, 0, 10.0]) + side - UP * low))
+    return out
+
+
+def test_what_floats_or_sinks_is_set_down_along_its_line_of_sight():
+    vertices = ball()
+    true = standing(vertices, 8)
+    errors = np.array([0.004, -0.005, 0.0, 0.003, -0.002, 0.001, -0.004, 0.002])
+    seen = [similarity(m[:3, :3], m[:3, 3] * (1 + e)) for m, e in zip(true, errors, strict=True)]
+    wrong = np.array([np.linalg.inv(m) for m in seen])
+    tilted = exp_so3(np.array([0.02, 0.0, 0.01])) @ UP
+    poses, plane, count = set_down(vertices, wrong, np.stack([[0, 0, 10.02], tilted]))
+    assert count == 8
+    assert np.degrees(np.arccos(plane[1] @ UP)) < 0.6
+    before = [np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(seen, true, strict=True)]
+    after = [np.linalg.norm(np.linalg.inv(p)[:3, 3] - b[:3, 3]) for p, b in zip(poses, true, strict=True)]
+    assert np.median(after) < 0.6 * np.median(before)
+    for p in poses:
+        assert abs(((move_points(np.linalg.inv(p), vertices) - plane[0]) @ plane[1]).min()) < 0.01
+    assert np.allclose(poses[:, :3, :3], wrong[:, :3, :3])
+
+
+def test_few_objects_stay_where_they_are():
+    vertices = ball()
+    poses = np.array([np.linalg.inv(m) for m in standing(vertices, SETTLED - 1)])
+    plane = np.stack([[0, 0, 10.0], UP])
+    same, _, count = set_down(vertices, poses, plane)
+    assert count == 0 and np.array_equal(same, poses)
+
+
+def test_ground_under_an_even_sky_shows_its_reflectance():
+    light = np.full((32, 64, 3), 2.0, np.float32)
+    assert ground_reflectance(light, np.array([0, 1.0, 0]), np.array([0.6, 0.4, 0.2])) == pytest.approx([0.3, 0.2, 0.1], rel=0.01)
+
+
+def test_below_the_ground_is_the_ground():
+    light = np.full((32, 64, 3), 2.0, np.float32)
+    up, height = np.array([0, 1.0, 0]), environment_directions(32, 64)[..., 1]
+    out = light_below(light, up, np.array([0.5, 0.4, 0.3]))
+    assert np.allclose(out[height > 0], 2.0) and np.allclose(out[height < -0.1], [0.5, 0.4, 0.3])
