@@ -56,7 +56,7 @@ def shading(n, learnt):
 
 
 def shade_world(m: Marched, rays, cameras, learnt, turns=None):
-    """The appearance itself: see `fit.volume.VolumeModel.appearance`. turns: Float, 9 for each view, the rotation (by rows) from its photo's
+    """The appearance itself: see `fit.volume.VolumeModel.appearance`. turns: Float, 9 a view, the rotation (by rows) from its photo's
     axes to those of the light, where views come from several photos; None where they come from one."""
     F = m.features
     n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
