@@ -241,7 +241,7 @@ def test_verdicts():
     scores[5] = 0.7
     judge_poses(scores, 0.4, shots, options, run)
     assert any("1 photos agree badly" in text and "5.jpg" in text for text in said)
-    judge_poses(scores, np.nan, shots, options, run)
+    judge_poses(scores[:8], np.nan, shots[:8], options, run)
     assert any("nothing tells" in text for text in said)
     for low, share in ((scores - 0.3, 0.4), (scores, 0.1)):
         with pytest.raises(UserError, match="could not be found") as raised:

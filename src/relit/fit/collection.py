@@ -1,6 +1,7 @@
 """Photos of one object from anywhere -> a relightable asset. The recipe of the `collection` capture (SAMURAI, Boss et al. 2022).
 
     photos       decode, masks (given, or guessed by GrabCut from the middle), focal length from EXIF or a guess
+    links        groups of photos whose features match                              cameras/links.py, fit/collection_links.py
     poses        coarse models and registration by rendering, in turns, from quadrants or one silhouette    fit/collection_poses.py
     volume       signed distance field, one small light per photo, cameras and focal lengths free           fit/volume.py
     second_look  photos that were put in a wrong place are searched for in the finished shape               fit/collection_held_out.py
@@ -19,9 +20,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.cameras.links import Group
 from relit.conventions import similarity
 from relit.errors import UserError
 from relit.fit.collection_held_out import held_out_stage, look_again
+from relit.fit.collection_links import links_stage, poses_from_links, with_focals
 from relit.fit.collection_options import CollectionOptions, options_for
 from relit.fit.collection_photos import Shot, crops_of, load_shots
 from relit.fit.collection_poses import GREY, agreement, find_poses, schedule_of
@@ -45,7 +48,7 @@ from relit.scene import Asset, Camera, Capture, Material, Mesh
 __all__ = ["CollectionOptions", "options_for", "reconstruct"]
 LIGHT = "one light per photo (collection)"
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
-STAGES = ("poses", "volume", "second_look", "mesh", "surface", "held_out")
+STAGES = ("links", "poses", "volume", "second_look", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
 COST = {"draft": (150.0, 1.2e9), "standard": (700.0, 2.0e9), "high": (2500.0, 3.0e9)}
 
@@ -55,9 +58,11 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
     light_family(options)  # a network that cannot be read is said before anything is searched
     shots, held, degrees = load_shots(capture, options, run)
     tints = np.array([s.tint for s in shots])
-    cameras, weights = pose_stage(shots, degrees, run, options, seed)
-    bank, cameras, model = volume_stage(shots, cameras, weights, tints, run, options, seed)
-    cameras = second_look_stage(bank, shots, cameras, model, degrees, run, options, seed)
+    groups = [] if "links" in options.without else links_stage(shots, run, seed)
+    shots = with_focals(shots, groups)
+    cameras, weights, held_fast = pose_stage(shots, groups, degrees, run, options, seed)
+    bank, cameras, model = volume_stage(shots, cameras, weights, held_fast, tints, run, options, seed)
+    cameras = second_look_stage(bank, shots, cameras, model, degrees, held_fast, run, options, seed)
     parts = mesh_stage(model, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     maps = surface_stage(bank, mesh, parts["albedo"], tints, run, options, seed)
@@ -68,37 +73,37 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
 # ---------------------------------------------------------------- stages
 
 
-def pose_stage(shots: list[Shot], degrees: float, run, options: CollectionOptions, seed: int):
-    """The cameras, and the photos' weights (P,)."""
+def pose_stage(shots: list[Shot], groups: list[Group], degrees: float, run, options: CollectionOptions, seed: int):
+    """The cameras, the photos' weights (P,), and which photos (P,) bool were put in place by matches."""
     if run.done("poses"):
         kept = run_arrays(run, "poses", "poses")
     else:
         with run.stage("poses", title="where the photos were taken from") as stage:
-            crops, hints = crops_of(shots), np.array([s.direction for s in shots])
-            try:
-                poses, scores = find_poses(
-                    crops,
-                    hints,
-                    degrees,
-                    schedule_of(options.rounds),
-                    options.keep,
-                    options.starts,
-                    options.without,
-                    seed,
-                    run.say,
-                    options.polish,
-                )
-            except ValueError as error:
-                why = f"{error}: the masks belong to different objects, or are wrong"
-                raise UserError("no shape agrees with the photos", why, "look at the masks (relit inspect)", code=4) from None
-            share = agreement(crops, poses, seed) if len(shots) >= CHECKED and "search" not in options.without else np.nan
-            kept = {"poses": poses, "scores": scores, "agreement": np.array(share)}
+            kept = find_all(shots, groups, degrees, run, options, seed)
             stage.save("poses", **kept)
         judge_poses(kept["scores"], float(kept["agreement"]), shots, options, run)
-    poses, scores = kept["poses"], kept["scores"]
+    poses, scores, linked = kept["poses"], kept["scores"], kept["linked"]
     loss = 1 - scores
     weights = np.ones(len(shots)) if "posterior" in options.without else posterior(loss, [*loss, *loss][:1000] * (20 // len(loss) + 1))
-    return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)], weights
+    return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)], weights, linked
+
+
+def find_all(shots: list[Shot], groups: list[Group], degrees: float, run, options: CollectionOptions, seed: int) -> dict[str, np.ndarray]:
+    """poses (P, 4, 4), scores (P,), agreement (a share, NaN where it was not tried), linked (P,) bool."""
+    crops, hints = crops_of(shots), np.array([s.direction for s in shots])
+    schedule, without = schedule_of(options.rounds), options.without
+    try:
+        begun = None if "search" in without else poses_from_links(crops, groups, shots, hints, degrees, options.keep, seed, run.say)
+        args = (crops, hints, degrees, schedule, options.keep, options.starts, without, seed, run.say, options.polish, begun)
+        poses, scores = find_poses(*args)
+    except ValueError as error:
+        why = f"{error}: the masks belong to different objects, or are wrong"
+        raise UserError("no shape agrees with the photos", why, "look at the masks (relit inspect)", code=4) from None
+    linked = np.zeros(len(shots), bool) if begun is None else begun[2]
+    share = np.nan
+    if len(shots) >= CHECKED and "search" not in without and linked.mean() < 0.5:
+        share = agreement(crops, poses, seed)
+    return {"poses": poses, "scores": scores, "agreement": np.array(share), "linked": linked}
 
 
 def judge_poses(scores: np.ndarray, share: float, shots: list[Shot], options: CollectionOptions, run) -> None:
@@ -108,7 +113,7 @@ def judge_poses(scores: np.ndarray, share: float, shots: list[Shot], options: Co
     run.say(f"mean score of the registration {mean:.3f} (1 is perfect; below {least} is a failure)")
     if np.isfinite(share):
         run.say(f"{share:.0%} of the photos find their place in a model of the others (below {options.least_agreement:.0%} is a failure)")
-    else:
+    elif len(shots) < CHECKED:
         run.say(f"note: with fewer than {CHECKED} photos nothing tells whether the poses are right: look at the result")
     worst = np.argsort(scores)
     low = [k for k in worst if scores[k] < np.median(scores) - 4 * max(float(np.median(np.abs(scores - np.median(scores)))), 0.004)]
@@ -127,8 +132,8 @@ def judge_poses(scores: np.ndarray, share: float, shots: list[Shot], options: Co
         )
 
 
-def volume_stage(shots, cameras, weights, tints, run, options: CollectionOptions, seed: int):
-    """(pixel bank with the final cameras, cameras, model)."""
+def volume_stage(shots, cameras, weights, linked, tints, run, options: CollectionOptions, seed: int):
+    """(pixel bank with the final cameras, cameras, model). Poses that come from matches move at a third of the others' rate."""
     masks = [s.mask for s in shots]
     bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], masks), weights, seed)
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
@@ -139,6 +144,7 @@ def volume_stage(shots, cameras, weights, tints, run, options: CollectionOptions
     model = start_model(values, np.full(3, GREY), None, full=False)
     model.reflections, model.rates = start_photo_lights(tints, GREY)
     model.appearance = shade_photos
+    model.extra["correction_rates"] = mi.Float(np.repeat(np.where(linked, 0.3, 1.0), 7).astype(np.float32))
     o = VolumeOptions(levels, steps, options.rays, sharpness=(1.5, 6.0), refine_cameras=options.refine_cameras)
     if run.done("volume"):
         restore_model(model, bank, run_arrays(run, "volume", "checkpoint"))
@@ -150,15 +156,15 @@ def volume_stage(shots, cameras, weights, tints, run, options: CollectionOptions
     return bank, cameras, model
 
 
-def second_look_stage(bank: PixelBank, shots, cameras, model: VolumeModel, degrees: float, run, options: CollectionOptions, seed: int):
-    """The cameras, those of lost photos found anew; `bank` gets them too."""
+def second_look_stage(bank: PixelBank, shots, cameras, model: VolumeModel, degrees, linked, run, options: CollectionOptions, seed: int):
+    """The cameras, those of lost photos found anew (`linked` ones are not lost); `bank` gets them too."""
     if "search" in options.without:
         return cameras
     if run.done("second_look"):
         kept = run_arrays(run, "second_look", "cameras")
     else:
         with run.stage("second_look", title="lost photos are looked for in the finished shape") as stage:
-            found, moved = look_again(shots, cameras, model, degrees, options, seed)
+            found, moved = look_again(shots, cameras, model, degrees, linked, options, seed)
             named = ", ".join(shots[i].photo.name for i in moved[:5])
             run.say(f"{len(moved)} photos moved to where they fit better{': ' if moved else ''}{named}")
             kept = {"poses": np.array([c.world_from_camera for c in found]), "focal": np.array([c.fx for c in found])}

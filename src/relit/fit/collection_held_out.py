@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.cameras.se3 import rotation_angle
+from relit.fit.collection_framing import is_cut, slide
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_photos import Shot, crops_of
 from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, Quiet, best_refined
@@ -69,27 +70,34 @@ def with_median_field(shot: Shot, cameras: list[Camera]) -> Camera:
     return replace(shot.camera, fx=focal, fy=focal)
 
 
-def find(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int):
-    """(crops, their descriptors, what renders the model, hypotheses of every photo) by search from all around."""
+def find(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int, slid: bool = False):
+    """(crops, their descriptors, what renders the model, hypotheses of every photo) by search from all around. slid: those
+    that the frame cuts with place and size free (takes a second a photo)."""
     crops, hints = crops_of(shots), np.array([s.direction for s in shots])
     render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops, PARTS)
     gallery = make_gallery(render, views_from(directions_around(AGAIN, seed)), PARTS)
     hinted = np.linalg.norm(hints, axis=1) > 0.5
     prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * hinted[:, None, None]
     allowed = near(gallery, hints, degrees + SLACK) | ~hinted[:, None]
-    return crops, rings, render, search(crops, gallery, options.keep, rings=rings, prior=prior, allowed=allowed)
+    found = search(crops, gallery, options.keep, rings=rings, prior=prior, allowed=allowed)
+    cut = np.flatnonzero([is_cut(c) for c in crops])
+    if slid and len(cut):
+        more = slide([crops[i] for i in cut], render, gallery.cameras, options.keep, allowed[cut], prior[cut].max(2))
+        found.poses[cut], found.scores[cut] = more.poses, more.scores
+    return crops, rings, render, found
 
 
 def register(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int) -> list[Camera]:
     """The cameras of photos that the model has not seen, by search and local refinement."""
-    crops, rings, render, found = find(shots, model, degrees, options, seed)
+    crops, rings, render, found = find(shots, model, degrees, options, seed, slid=True)
     poses, _ = best_refined(crops, found, render, rings, options.keep)
     return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)]
 
 
-def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int):
+def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, degrees: float, still, options: CollectionOptions, seed: int):
     """(cameras, numbers of the photos that moved): every photo is searched for in the finished model, whose detail tells apart what the
-    coarse ones took for each other (a stool from above, half a turn away). Those that fit elsewhere by GAIN move there, and descend."""
+    coarse ones took for each other (a stool from above, half a turn away). Those that fit elsewhere by GAIN move there, and descend.
+    still: (P,) bool, photos that stay."""
     shots = [replace(s, camera=c.with_pose(np.eye(4))) for s, c in zip(shots, cameras, strict=True)]
     present = np.array([c.world_from_camera for c in cameras])
     crops, rings, render, found = find(shots, model, degrees, options, seed)
@@ -97,7 +105,8 @@ def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, deg
     best = np.where(away, found.scores, -1).argmax(1)
     rows = np.arange(len(shots))
     _, height = refine(crops, present, render, rings=rings, steps=(0,), parts=PARTS)
-    tried = np.flatnonzero(away[rows, best] & (found.scores[rows, best] > height - 0.06))
+    still = still | np.array([is_cut(c) for c in crops])  # whole silhouettes are compared: they tell nothing of cut ones
+    tried = np.flatnonzero(~still & away[rows, best] & (found.scores[rows, best] > height - 0.06))
     if not len(tried):
         return cameras, []
     some = [crops[i] for i in tried]
@@ -117,7 +126,7 @@ def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, option
     bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
     learnt, rates = start_photo_lights(np.array([s.tint for s in shots]), GREY)
-    own = replace(model, reflections=learnt, rates=rates, appearance=shade_photos)
+    own = replace(model, reflections=learnt, rates=rates, appearance=shade_photos, extra={})
     own.grid = replace(model.grid)
     o = VolumeOptions(
         (model.grid.n,),

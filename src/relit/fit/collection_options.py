@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from relit.errors import UserError, did_you_mean
 
-WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "light_prior")
+WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "light_prior", "links")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,9 @@ from scipy.ndimage import distance_transform_edt
 
 from relit.cameras.se3 import look_at, rotation_angle
 from relit.conventions import similarity
-from relit.fit.pixels import corrected, make_bank
+from relit.fit.collection_framing import crop_bank, is_cut, not_empty
+from relit.fit.loop import NoStage
+from relit.fit.pixels import corrected
 from relit.fit.register import (
     REFINE,
     Crop,
@@ -67,22 +69,6 @@ def schedule_of(rounds: int) -> Schedule:
     return Schedule(*(tuple(getattr(full, name)[i] for i in at) for name in ("nodes", "steps", "views", "tolerance")))
 
 
-class Quiet:
-    """A stage that keeps nothing: for fits that take a second."""
-
-    def step(self, i, **values):
-        pass
-
-    def load(self, name):
-        return None
-
-    def save(self, name, **arrays):
-        pass
-
-    def checkpoint_due(self):
-        return False
-
-
 def even_colours(crops: list[Crop]) -> list[Crop]:
     """The crops with the mean colour of the object at GREY: exposure and white of each photo go, shading stays."""
     out = []
@@ -109,8 +95,11 @@ def pose_towards(crop: Crop, direction: np.ndarray) -> np.ndarray:
 
 
 def gauge(crops: list[Crop], poses: np.ndarray) -> np.ndarray:
-    """The poses scaled so that silhouettes have SPREAD on average: alternating fits would drift in scale."""
-    scale = np.median([np.linalg.norm(p[:3, 3]) / distance_for(c) for p, c in zip(poses, crops, strict=True)])
+    """The poses scaled so that silhouettes have SPREAD on average: alternating fits would drift in scale. Only whole ones
+    count, where there are some."""
+    whole = [k for k, c in enumerate(crops) if not is_cut(c)]
+    counted = whole if len(whole) >= 3 else range(len(crops))
+    scale = np.median([np.linalg.norm(poses[k][:3, 3]) / distance_for(crops[k]) for k in counted])
     out = np.array(poses)
     out[:, :3, 3] /= scale
     return out
@@ -132,12 +121,12 @@ def hull_by_vote(cameras: list[Camera], masks: list[np.ndarray], nodes: int, tol
 
 def coarse_model(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, tolerance: float, seed: int, limit=None) -> VolumeModel:
     """Hull by vote and a short volume fit. limit: (n, n, n) bool, where the object may be, or None."""
-    cameras, masks = crop_views(crops, poses), [c.mask for c in crops]
-    values = hull_by_vote(cameras, masks, nodes, tolerance, limit)
+    cameras = crop_views(crops, poses)
+    values = hull_by_vote(cameras, not_empty(crops), nodes, tolerance, limit)
     model = start_model(values, np.full(3, GREY), None, full=False)
-    bank = make_bank(cameras, [c.rgb for c in crops], masks)
+    bank = crop_bank(crops, cameras)
     options = VolumeOptions((nodes,), (steps,), 4096, sdf_rate=0.1, feature_rate=0.03, sharpness=(0.7, 1.5), step=0.8)
-    return fit_volume(bank, model, options, Quiet(), seed)
+    return fit_volume(bank, model, options, NoStage(), seed)
 
 
 def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep: int = 3):
@@ -174,16 +163,19 @@ def best_refined(crops, found, render, rings, keep: int, steps=REFINE):
     return best, score
 
 
-def descended(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed: int) -> tuple[VolumeModel, np.ndarray]:
-    """A model with one small light per photo, fitted with the poses free; and the poses. Focal lengths stay."""
-    cameras, masks = crop_views(crops, gauge(crops, poses)), [c.mask for c in crops]
-    model = start_model(hull_by_vote(cameras, masks, nodes, 0.12), np.full(3, GREY), None, full=False)
+def descended(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed: int, held=None) -> tuple[VolumeModel, np.ndarray]:
+    """A model with one small light per photo, fitted with the poses free, but for those of `held` photos (P,); and the poses. Focal
+    lengths stay."""
+    cameras = crop_views(crops, gauge(crops, poses))
+    model = start_model(hull_by_vote(cameras, not_empty(crops), nodes, 0.12), np.full(3, GREY), None, full=False)
     model.reflections, model.rates = start_photo_lights(np.full((len(crops), 3), GREY), GREY)
     model.appearance = shade_photos
-    bank = make_bank(cameras, [c.rgb for c in crops], masks)
+    bank = crop_bank(crops, cameras)
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    if held is not None:
+        model.extra["correction_rates"] = mi.Float(np.repeat(1.0 - np.asarray(held, np.float32), 7))
     options = VolumeOptions((nodes,), (steps,), 4096, feature_rate=0.03, sharpness=(1.0, 3.0), step=0.8, refine_cameras=0.005)
-    fit_volume(bank, model, options, Quiet(), seed)
+    fit_volume(bank, model, options, NoStage(), seed)
     numbers = np.array(bank.corrections).reshape(-1, 7)
     numbers[:, 6] = 0
     found = corrected(cameras, numbers.ravel())
@@ -191,12 +183,15 @@ def descended(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed
     return model, np.array(moved)
 
 
-def polish(crops: list[Crop], poses: np.ndarray, directions: np.ndarray, degrees: float, keep: int, seed: int, say, cycles: int):
-    """Descend, then search again in the sharper model: descent brings most photos to within a degree or two, the search the others."""
+def polish(crops: list[Crop], poses, directions: np.ndarray, degrees: float, keep: int, seed: int, say, cycles: int, held=None):
+    """Descend, then search again in the sharper model: descent brings most photos to within a degree or two, the search the others.
+    held: (P,) bool, photos that only descend, or None."""
     rings, scores = crop_rings(crops, PARTS), np.zeros(len(crops))
+    held = np.zeros(len(crops), bool) if held is None else held
+    still = np.array([is_cut(c) for c in crops]) | held  # a search by whole silhouettes tells nothing of cut ones
     hinted = np.linalg.norm(directions, axis=1) > 0.5
     for i in range(cycles):
-        model, poses = descended(crops, poses, 48, 200, seed + 200 + i)
+        model, poses = descended(crops, poses, 48, 200, seed + 200 + i, held)
         render = volume_render(replace(model, appearance=shade_plain))
         gallery = make_gallery(render, views_from(directions_around(500, seed + 200 + i)), PARTS)
         prior = 0.5 * HINT * hint_prior(gallery, directions, degrees, 45.0) * hinted[:, None, None]
@@ -204,8 +199,9 @@ def polish(crops: list[Crop], poses: np.ndarray, directions: np.ndarray, degrees
         found = search(crops, gallery, keep, rings=rings, prior=prior, allowed=allowed)
         own, height = refine(crops, poses, render, rings=rings, steps=(0, 1.5), parts=PARTS)
         other, scores = best_refined(crops, found, render, rings, keep, COARSE)
-        stays = height + ELSEWHERE >= scores
-        poses = np.where(stays[:, None, None], own, other)
+        stays = (height + ELSEWHERE >= scores) | still
+        poses = np.where(held[:, None, None], poses, np.where(stays[:, None, None], own, other))
+        scores = np.where(still, height, scores)
         scores = np.maximum(height, scores)
         say(
             f"descent and search, {i + 1} of {cycles}: mean score {scores.mean():.3f}, {(~stays).sum()} photos found elsewhere",
@@ -277,9 +273,11 @@ def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=
     return poses, scores
 
 
-def find_poses(crops, directions, degrees: float, schedule: Schedule, keep: int, starts: int, without, seed: int, say, cycles: int = 0):
+def find_poses(
+    crops, directions, degrees: float, schedule: Schedule, keep: int, starts: int, without, seed: int, say, cycles: int = 0, linked=None
+):
     """Poses (P, 4, 4) and scores (P,), from hints where half of the photos have them, else by growth. cycles: of `polish` after that.
-    without: names of `collection.WITHOUT`."""
+    without: names of `collection.WITHOUT`. linked: (poses, scores, held) of `collection_links.poses_from_links`, which then come first."""
     hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
     keep = 1 if "multiplex" in without else keep
     if "search" in without:
@@ -290,11 +288,14 @@ def find_poses(crops, directions, degrees: float, schedule: Schedule, keep: int,
     def tell(text, *_):
         say(text)
 
-    if hinted >= 0.5:
+    held = None
+    if linked is not None:
+        poses, scores, held = linked
+    elif hinted >= 0.5:
         poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep)
     else:
         poses, scores = poses_by_growth(crops, starts, keep, seed, tell)
-    return polish(crops, poses, directions, degrees, keep, seed, tell, cycles) if cycles > 0 else (poses, scores)
+    return polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held) if cycles > 0 else (poses, scores)
 
 
 def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
