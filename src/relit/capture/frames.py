@@ -13,6 +13,7 @@ from relit.cameras.pinhole import Lens
 from relit.cameras.se3 import nearest_rotation
 from relit.errors import UserError
 from relit.images import EXTENSIONS
+from relit.masks.rle import Runs
 from relit.scene import Camera, Sphere
 
 MAX_TEXT = 256 * 2**20  # bytes of a camera file; larger ones are not camera files
@@ -25,7 +26,8 @@ class Frame:
     """One photo file and its camera as calibrated.
 
     name: relative to the capture's root, as the user knows it. camera: in pixels of the calibration (the file may be a resized copy), its
-    `distortion` filled for OpenCV's model. lens: any other lens, or None. mask: a mask file that the format names, or None.
+    `distortion` filled for OpenCV's model. lens: any other lens, or None. mask: a mask file that the format names, or None. runs: a
+    mask that the format itself holds, or None.
     """
 
     path: Path
@@ -34,6 +36,7 @@ class Frame:
     lens: Lens | None = None
     mask: Path | None = None
     held_out: bool = False
+    runs: Runs | None = None
 
 
 @dataclass(frozen=True)

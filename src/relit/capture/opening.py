@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from relit.cameras.pinhole import lens_of
-from relit.capture import colmap_model, idr, iron, llff, middlebury, photo, samurai, sfd, transforms_json
+from relit.capture import colmap_model, idr, iron, llff, middlebury, mvmc, photo, samurai, sfd, transforms_json
 from relit.capture.corrections import Corrected, corrected_masks, corrected_sphere, with_corrected_masks
 from relit.capture.frames import Frame, Reading
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
@@ -29,6 +29,7 @@ READERS = {  # in this order; the first that recognises the folder reads it
     "middlebury": middlebury,
     "colmap": colmap_model,
     "samurai": samurai,
+    "mvmc": mvmc,
     "llff": llff,
     "photos": photo,
 }
@@ -192,6 +193,8 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
         )
     elif any(h.alpha for h in headers):
         notes.append(f"only {sum(h.alpha for h in headers)} of {len(headers)} photos have an alpha channel: it is not used as a mask")
+    if wanted in ("auto", "files") and any(f.runs for f in reading.frames):
+        return (*_from_runs(reading, photos, notes), False)
     if wanted in ("auto", "files"):
         result = _from_files(reading, photos, wanted == "files", notes)
         if result is not None:
@@ -226,6 +229,22 @@ def _say_empty(empty: list[str], notes: list[str]) -> None:
         notes.append(f"{len(empty)} photos have an empty mask and are not used, for example {empty[0]}")
 
 
+def _from_runs(reading: Reading, photos: list[Photo], notes: list[str]):
+    """(photos, small masks) of a format that holds its masks itself."""
+    lacking = [f.name for f in reading.frames if f.runs is None]
+    if lacking:
+        what = f"{len(lacking)} of {len(photos)} photos have no mask in the file, for example {lacking[0]}"
+        raise UserError(what, fix=f"add their run lengths, or use --masks none: {reading.root}")
+    masked = [_with(p, mask=f.runs) for p, f in zip(photos, reading.frames, strict=True)]
+    small = [
+        _shrunk(photo.fitted_mask(f.runs.decode(), (p.height, p.width), p.load.orientation, f.name))
+        for p, f in zip(photos, reading.frames, strict=True)
+    ]
+    _say_empty(judge(_named(reading, small), "the run lengths")[1], notes)
+    notes.append("masks come from run lengths")
+    return masked, small
+
+
 def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
     folder, index = index_masks(reading.root)
     files = [f.mask or find_mask(f.path, reading.root, index) for f in reading.frames]
@@ -255,7 +274,10 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
 
 
 def _small_mask(path: Path, p: Photo) -> np.ndarray:
-    mask = photo.upright_mask(read_mask(path), (p.height, p.width), p.load.orientation)
+    return _shrunk(photo.upright_mask(read_mask(path), (p.height, p.width), p.load.orientation))
+
+
+def _shrunk(mask: np.ndarray) -> np.ndarray:
     h, w = mask.shape
     s = min(1.0, SMALL / max(h, w))
     return mask if s == 1 else cv2.resize(mask, (max(1, round(w * s)), max(1, round(h * s))), interpolation=cv2.INTER_AREA)

@@ -15,6 +15,7 @@ from relit.capture.frames import Frame, Reading, image_folder, list_images
 from relit.errors import UserError
 from relit.images import EXTENSIONS, RAW, Header, read_data, read_header, read_image, turn_upright
 from relit.masks.files import read_mask
+from relit.masks.rle import Runs
 from relit.masks.threshold import Backdrop
 from relit.scene import Camera, Photo, Pixels
 
@@ -25,14 +26,14 @@ NORMAL_FOLDERS = ("normals", "normal")
 class Decoder:
     """Reads one photo file. Called without arguments it returns the upright `Pixels` at `size` (width, height), lens distortion kept.
 
-    mask: a file, a backdrop, True for the file's own alpha channel, or None. invert: the mask file is white off the object.
+    mask: a file, run lengths, a backdrop, True for the file's own alpha channel, or None. invert: the mask file is white off the object.
     orientation: the photo's in EXIF, for masks that were made from the pixels as stored.
     """
 
     path: Path
     size: tuple[int, int]
     upright: bool = True
-    mask: Path | Backdrop | bool | None = None
+    mask: Path | Runs | Backdrop | bool | None = None
     invert: bool = False
     normal: Path | None = None
     orientation: int = 1
@@ -46,6 +47,8 @@ class Decoder:
             mask = image.alpha
         elif isinstance(self.mask, Path):
             mask = file_mask(self.mask, shape, self.invert, self.orientation)
+        elif isinstance(self.mask, Runs):
+            mask = fitted_mask(self.mask.decode(), shape, self.orientation, f"the runs of '{self.mask.name}'")
         elif isinstance(self.mask, Backdrop):
             mask = self.mask(rgb)
             if self.mask.dark:
@@ -157,17 +160,23 @@ def photo_from(frame: Frame, header: Header, max_side: int | None, normals: dict
 
 def file_mask(path: Path, shape: tuple[int, int], invert: bool = False, orientation: int = 1) -> np.ndarray:
     """A mask file at the size of its photo (H, W). Raises UserError when the shapes differ."""
-    mask = upright_mask(read_mask(path), shape, orientation)
+    mask = fitted_mask(read_mask(path), shape, orientation, path)
+    return 1.0 - mask if invert else mask
+
+
+def fitted_mask(mask: np.ndarray, shape: tuple[int, int], orientation: int, source: Path | str) -> np.ndarray:
+    """A mask (H', W') at the size of its photo, upright, float32. Raises UserError when the shapes differ."""
+    mask = upright_mask(mask, shape, orientation)
     h, w = shape
     if mask.shape != (h, w):
         if abs(mask.shape[1] / mask.shape[0] - w / h) > 0.02 * (w / h):
             raise UserError(
                 f"a mask and its photo have different shapes: {mask.shape[1]} x {mask.shape[0]} and {w} x {h} pixels",
                 "the mask belongs to another photo, or one of them was turned",
-                f"make it again from the photo: {path}",
+                f"make it again from the photo: {source}",
             )
         mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA if mask.shape[0] > h else cv2.INTER_LINEAR)
-    return 1.0 - mask if invert else np.ascontiguousarray(mask, dtype=np.float32)
+    return np.ascontiguousarray(mask, dtype=np.float32)
 
 
 def index_normals(root: Path) -> dict[str, Path]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from relit.capture import mvmc
 from relit.capture.frames import Frame, Reading, image_folder, list_images, read_json
 from relit.errors import UserError, did_you_mean
 
@@ -76,8 +77,8 @@ def _names(content: dict, source: Path) -> list[str]:
 
 
 def read_hints(root: Path, names: list[str]) -> Hints | None:
-    """What quadrants.json or metadata.json under `root` says about the photos `names` (as the capture knows them); None where there is
-    neither. Raises UserError for answers that are malformed, belong to other photos, or are 'Center' three times."""
+    """What quadrants.json, metadata.json or MVMC's annotations.json under `root` says about the photos `names` (as the capture knows them);
+    None where there is none. Raises UserError for answers that are malformed, belong to other photos, or are 'Center' three times."""
     root = root if root.is_dir() else root.parent
     if (root / QUADRANTS).is_file():
         return _quadrants(root / QUADRANTS, names)
@@ -85,6 +86,11 @@ def read_hints(root: Path, names: list[str]) -> Hints | None:
         content = read_json(root / ANGLES)
         if "azimuths" in content:
             return _angles(content, root / ANGLES, names)
+    cars = mvmc.recognise(root)
+    if cars is not None:
+        said = mvmc.directions_of(cars)
+        directions = {n: said[Path(n).name] for n in names if Path(n).name in said}
+        return Hints(directions, 35.0, cars.name) if directions else None
     return None
 
 
