@@ -27,6 +27,7 @@ from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_secon
 
 CHECKPOINT_SECONDS = 20.0  # a checkpoint is due this long after the last one, later if writing one is slow
 CHECKPOINT_LONGEST = 60.0  # ... but never later than this
+PREVIEW_SECONDS = 10.0  # between two previews of a stage
 METRICS_SECONDS = 0.5  # between two lines of metrics.jsonl
 FILES = ("config.toml", "inputs.json", "evaluation.json", "log.txt", "metrics.jsonl", "report.html")
 OWNED = (*FILES, "stages", "previews", "photos", "asset")
@@ -147,6 +148,7 @@ class Stage:
         self._begun = self._saved = time.monotonic()
         self._written = -math.inf
         self._interval = CHECKPOINT_SECONDS
+        self._shown = time.monotonic()
         self._progress = Progress(run.log, title, steps)
 
     @property
@@ -197,13 +199,19 @@ class Stage:
             self.run.say(f"checkpoint {name} of stage {self.name} cannot be read and is left out ({type(error).__name__}): {path}")
             return None
 
-    def preview(self, name: str, linear_rgb: np.ndarray) -> None:
-        """Write a linear (H, W, 3) picture to previews/<stage>_<name>.jpg."""
+    def preview_due(self) -> bool:
+        """True when the last preview (or the beginning) is 10 s ago."""
+        return time.monotonic() - self._shown >= PREVIEW_SECONDS
+
+    def preview(self, picture: Callable[[], np.ndarray]) -> None:
+        """Write the linear (H, W, 3) picture that `picture` makes to previews/<stage>.jpg."""
         from relit.images import write_srgb
 
         folder = self.run.folder / "previews"
-        folder.mkdir(exist_ok=True)
-        write_srgb(folder / f"{self.name}_{name}.jpg", linear_rgb)
+        with disk_errors(self.run.folder):
+            folder.mkdir(exist_ok=True)
+            write_srgb(folder / f"{self.name}.jpg", picture())
+        self._shown = time.monotonic()
 
 
 def read_stages(folder: Path) -> list[dict]:

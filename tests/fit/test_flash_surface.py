@@ -8,6 +8,7 @@ import pytest
 
 from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, calm_weights, fit_flash_surface, offset_of
 from relit.fit.kinship import best_lobes, start_kinship
+from relit.fit.loop import NoStage
 from relit.fit.pixels import batch_of
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import plastic_at, plastic_pictures, start_plastic
@@ -72,22 +73,6 @@ def test_gradients(shot, name):
     assert at(0, grad=True) == pytest.approx((at(h) - at(-h)) / (2 * h), rel=0.03)
 
 
-class Quiet:
-    """A stage that keeps nothing."""
-
-    def load(self, name):
-        return None
-
-    def save(self, *a, **k):
-        pass
-
-    def step(self, *a, **k):
-        pass
-
-    def checkpoint_due(self):
-        return False
-
-
 def fitted(shot, kin=True, **options):
     """The model after a short fit from a co-located flash and one grey material."""
     bank, views, mesh, truth = shot
@@ -101,7 +86,7 @@ def fitted(shot, kin=True, **options):
         kinship = start_kinship(features[..., :3], np.ones((size, size), bool), np.stack([flat, 0.4 * flat], -1), groups=6)
     model = FlashModel(start, mi.Float(features.ravel()), kinship, dr.zeros(mi.Float, 3), mi.Float([np.log(scene.INTENSITY)]), Coat())
     settings = {"steps": 200, "points": 2048, "directions": 0, "offset_rate": 0.006, **options}
-    fit_flash_surface(bank, views, mesh, model, FlashSurfaceOptions(**settings), Quiet())
+    fit_flash_surface(bank, views, mesh, model, FlashSurfaceOptions(**settings), NoStage())
     return model
 
 

@@ -7,9 +7,11 @@ import pytest
 import trimesh
 
 from relit.capture import open_capture
+from relit.conventions import srgb_from_linear
 from relit.errors import UserError
 from relit.fit.multiview import MultiviewOptions, options_for, reconstruct
-from relit.run import Run
+from relit.images import read_image
+from relit.run import Run, Stage
 
 TINY = MultiviewOptions(
     levels=(24, 40),
@@ -85,26 +87,35 @@ def test_a_ball_comes_back(capture_folder, tmp_path):
     truth, shown = photo.load(), render(scene, photo.camera, spp=32)
     error = np.clip(shown[..., :3], 0, 1) ** (1 / 2.2) - np.clip(truth.rgb, 0, 1) ** (1 / 2.2)
     assert -10 * np.log10(np.mean(error**2)) > 22
+    # what `relit view` shows meanwhile: photo and volume model, then photo, base colour and roughness, all at the photo's size
+    first = read_image(tmp_path / "run" / "previews" / "volume.jpg").rgb
+    assert first.shape == (64, 2 * 64, 3)
+    photo = np.clip(capture.photos[0].load().rgb, 0, 1)
+    assert np.abs(srgb_from_linear(first[:, :64]) - srgb_from_linear(photo)).mean() < 0.02
+    assert np.abs(srgb_from_linear(first[:, 64:]) - srgb_from_linear(photo)).mean() < 0.06 < srgb_from_linear(photo).mean()
+    second = read_image(tmp_path / "run" / "previews" / "surface.jpg").rgb
+    inside = photo[24:40, 24:40].sum(-1) > 0
+    assert second.shape == (64, 3 * 64, 3) and inside.all()
+    assert 0.03 < second[24:40, 88:104].mean() < 1 and second[24:40, 152:168].std(-1).max() < 0.05
 
 
 def test_it_goes_on_from_a_checkpoint(capture_folder, tmp_path, monkeypatch):
     """A stop in the second level, then the same call: the steps before the checkpoint are not done again, and the result is as good."""
     import relit.fit.volume as volume
-    from relit.run import Stage
 
     capture = open_capture(capture_folder)
     monkeypatch.setattr(Stage, "checkpoint_due", lambda self: True)
     counted = []
     original = volume.run_steps
 
-    def stopping(stage, first, last, step, save=None, name="checkpoint"):
+    def stopping(stage, first, last, step, save=None, name="checkpoint", preview=None):
         def counting(i):
             counted.append(i)
             if len(counted) == 90:
                 raise KeyboardInterrupt
             return step(i)
 
-        original(stage, first, last, counting, save, name)
+        original(stage, first, last, counting, save, name, preview)
 
     monkeypatch.setattr(volume, "run_steps", stopping)
     with Run.open(tmp_path / "run", {}) as run, pytest.raises(KeyboardInterrupt):
@@ -128,7 +139,20 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
     module = {"volume": volume, "surface": surface}[stage]
     original = module.run_steps
 
-    def watching(s, first, last, step, save=None, name="checkpoint"):
+    monkeypatch.setattr(Stage, "preview_due", lambda self: True)
+
+    def watching(s, first, last, step, save=None, name="checkpoint", preview=None):
+        pictures = []
+
+        def pictured():  # previews too compile what they need at the first one
+            dr.kernel_history_clear()
+            out = preview()
+            hashes = {k["hash"] for k in dr.kernel_history() if "hash" in k}
+            assert not pictures or not hashes - seen
+            pictures.append(out)
+            seen.update(hashes)
+            return out
+
         def watched(i):
             dr.kernel_history_clear()
             out = step(i)
@@ -141,7 +165,8 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
             return out
 
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            original(s, first, min(last, first + 20), watched, None, name)
+            original(s, first, min(last, first + 20), watched, None, name, pictured)
+        assert len(pictures) == 20
 
     monkeypatch.setattr(module, "run_steps", watching)
     with Run.open(tmp_path / "run", {}) as run:

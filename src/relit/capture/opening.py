@@ -50,12 +50,13 @@ def open_capture(
     """Read a capture of any known format; photos decode later, when `Photo.load` is called.
 
     sphere: the object sphere in the units of the cameras; found when not given. masks: 'auto' takes alpha channels, else mask files, else
-    a plain backdrop, else none; 'none', 'alpha', 'files', 'threshold', 'grabcut', 'segment' ask for one kind.
+    a plain backdrop, else none; 'none', 'alpha', 'files', 'threshold', 'grabcut', 'segment' ask for one kind, and 'segment:NAME' for a
+    network of rembg's other than its U^2-Net.
     max_side: photos are resized to at most so many pixels. min_photos: fewer photos are an error. focal: pixels, of a photo of duplicates.
     Raises UserError (exit code 3) for everything that is wrong with the input.
     """
     path = Path(path).expanduser()
-    if masks not in MASKS:
+    if masks not in MASKS and not masks.startswith("segment:"):
         raise UserError(f"unknown kind of masks '{masks}'.{did_you_mean(masks, MASKS)}", fix=f"choose one of {', '.join(MASKS)}", code=2)
     if not path.exists():
         raise UserError("the input is not there", fix=f"check the path: {path}")
@@ -203,12 +204,17 @@ def _masked(reading: Reading, headers: list[Header], photos: list[Photo], wanted
         result = _from_backdrop(reading, photos, wanted == "threshold", notes)
         if result is not None:
             return result
-    if wanted == "segment":
-        mask_of = segmenter()
-        masks = [mask_of(p.load().rgb) for p in photos]
-        judge({p.name: m for p, m in zip(photos, masks, strict=True)}, "the segmenter")
+    if wanted.startswith("segment"):
+        mask_of = segmenter(*wanted.split(":", 1)[1:])
+        masked, small = [], []
+        for p in photos:
+            m = mask_of(p.load().rgb)
+            masked.append(photo.with_mask(p, m))
+            scale = min(1.0, SMALL / max(m.shape))
+            small.append(cv2.resize(m, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+        _say_empty(judge(_named(reading, small), "the segmenter")[1], notes)
         notes.append("masks were found by the segmenter; look at them")
-        return [photo.with_mask(p, m) for p, m in zip(photos, masks, strict=True)], masks, False
+        return masked, small, False
     return photos, none, False
 
 

@@ -12,8 +12,9 @@ from relit.cameras.se3 import rotation_angle
 from relit.fit.collection_framing import is_cut, slide
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_photos import Shot, crops_of
-from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, Quiet, best_refined
+from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, best_refined
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, start_collection_surface
+from relit.fit.loop import NoStage
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import corrected, make_bank
 from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, near, refine, search, views_from, volume_render
@@ -139,5 +140,5 @@ def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, option
         sharpness=(2.0, 6.0),
         refine_cameras=options.refine_cameras,
     )
-    fit_volume(bank, own, o, Quiet(), seed)
+    fit_volume(bank, own, o, NoStage(), seed)
     return corrected(cameras, np.array(bank.corrections))

@@ -16,6 +16,7 @@ from relit.fit.collection_options import CollectionOptions
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.preview import surface_preview
 from relit.fit.surface import SurfaceOptions, material_prior, neighbours, parsimony
 from relit.lighting.neural_pil import load_neural_pil
 from relit.lighting.per_photo import TEXELS, LightComponents, PhotoLights, light_prior, log_lights, mean_level
@@ -185,7 +186,11 @@ def fit_collection_surface(
         arrays = {"colour": np.array(material.colour), "metallic": np.array(material.metallic), "slope": np.array(material.slope)}
         return {**arrays, "coefficients": model.coefficients, "gains": model.gains, "weights": model.weights}
 
-    run_steps(stage, first, options.steps, step, state)
+    def textures(uv, valid):
+        at = material_at(material, uv, valid)
+        return [at.base, at.roughness]
+
+    run_steps(stage, first, options.steps, step, state, preview=surface_preview(bank, mesh, textures))
     return model
 
 

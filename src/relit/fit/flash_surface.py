@@ -20,6 +20,7 @@ from relit.fit.kinship import Kinship, share_evidence
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.preview import surface_preview
 from relit.fit.surface import neighbours
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import PlasticField, plastic_at, project
@@ -185,7 +186,11 @@ def fit_flash_surface(
         values |= {"level": model.kinship.level, "sums": model.kinship.sums} if model.kinship is not None else {}
         return {name: np.array(value) for name, value in values.items()}
 
-    run_steps(stage, first, o.steps, step, state)
+    def textures(uv, valid):
+        at, _ = plastic_at(field, uv, valid)
+        return [at.diffuse, at.specular, at.alpha]
+
+    run_steps(stage, first, o.steps, step, state, preview=surface_preview(bank, mesh, textures))
     return model
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from relit.conventions import similarity
+from relit.fit.loop import NoStage
 from relit.fit.pixels import PixelBank, corrected, make_bank
 from relit.fit.register import volume_render
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
@@ -101,22 +102,6 @@ def pixel_bank(views: list[View], poses: np.ndarray) -> PixelBank:
     candidates = np.array(bank.candidates)
     bank.candidates = mi.UInt32(candidates[known[candidates]])
     return bank
-
-
-class NoStage:
-    """Stands where a stage of a run is asked for: nothing is kept or shown."""
-
-    def load(self, name):
-        return None
-
-    def save(self, name, **values):
-        pass
-
-    def step(self, i, **values):
-        pass
-
-    def checkpoint_due(self):
-        return False
 
 
 # ---------------------------------------------------------------- the model

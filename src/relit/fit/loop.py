@@ -44,6 +44,28 @@ class Adam:
         self.m, self.v, self.t = mi.Float(state["m"]), mi.Float(state["v"]), int(state["t"])
 
 
+class NoStage:
+    """Stands where a stage of a run is asked for: nothing is kept or shown."""
+
+    def load(self, name):
+        return None
+
+    def save(self, name, **arrays):
+        pass
+
+    def step(self, i, **losses):
+        pass
+
+    def checkpoint_due(self):
+        return False
+
+    def preview_due(self):
+        return False
+
+    def preview(self, picture):
+        pass
+
+
 def cosine_decay(e: float, final: float) -> float:
     """1 at e = 0, `final` at e = 1."""
     import math
@@ -51,10 +73,20 @@ def cosine_decay(e: float, final: float) -> float:
     return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * min(max(e, 0.0), 1.0)))
 
 
-def run_steps(stage, first: int, last: int, step: Callable[[int], dict], save: Callable[[], dict] | None = None, name: str = "checkpoint"):
-    """Call step(i) for i in [first, last), report its losses, and save a checkpoint when one is due."""
+def run_steps(
+    stage,
+    first: int,
+    last: int,
+    step: Callable[[int], dict],
+    save: Callable[[], dict] | None = None,
+    name: str = "checkpoint",
+    preview: Callable[[], Any] | None = None,
+):
+    """Call step(i) for i in [first, last), report its losses, save a checkpoint when one is due, and a picture, `preview`, now and then."""
     for i in range(first, last):
         losses = step(i)
         stage.step(i + 1, **{name: (lambda v=value: float(v[0])) for name, value in losses.items()})
+        if preview is not None and (i == first or i + 1 == last or stage.preview_due()):
+            stage.preview(preview)
         if save is not None and stage.checkpoint_due():
             stage.save(name, step=i + 1, **save())

@@ -17,6 +17,7 @@ from relit.fit.exchange import REFRESH, Exchange
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.preview import surface_preview
 from relit.lighting.environment import Environment
 from relit.materials.field import MaterialField, material_at, project, slope_at, start_material
 from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits, reflected, sample_lights
@@ -185,7 +186,11 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": model.log_light}
         return {name: np.array(value) for name, value in names.items()}
 
-    run_steps(stage, first, options.steps, step, state)
+    def textures(uv, valid):
+        at = material_at(material, uv, valid)
+        return [at.base, at.roughness]
+
+    run_steps(stage, first, options.steps, step, state, preview=surface_preview(bank, mesh, textures))
     return model
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import PixelBank, RayBatch, batch_of, camera_rows, draw_pixels, rays_through
+from relit.fit.preview import volume_preview
 from relit.geometry.sdf import (
     SdfGrid,
     dense_values,
@@ -205,7 +206,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         write_rows(grid)
         return report
 
-    run_steps(stage, first, end, step, lambda: _state(model, bank))
+    corrections = (lambda: bank.corrections) if refine else None
+    run_steps(stage, first, end, step, lambda: _state(model, bank), preview=volume_preview(bank, model, options.step, corrections))
 
 
 def render_views(model: VolumeModel, cameras: list[Camera], step: float = 0.9) -> list[np.ndarray]:

@@ -115,7 +115,7 @@ def job_flags(parser: Parser, quality: str | None) -> None:
 def opening_flags(parser: Parser) -> None:
     """Flags that say how the input is to be read."""
     add = parser.more.add_argument
-    add("--masks", default=None, metavar="HOW", help="auto (default), none, alpha, files, threshold, grabcut, segment")
+    add("--masks", default=None, metavar="HOW", help="auto (default), none, alpha, files, threshold, grabcut, segment[:NETWORK]")
     add("--sphere", type=sphere, default=None, metavar="X,Y,Z,R", help="ball that holds the object, in the frame and unit of the cameras")
     add("--max-side", type=int, default=None, metavar="PIXELS", help="shrink photos whose longer side is longer")
 
