@@ -81,6 +81,10 @@ def open_input(path: Path, job: Job) -> Capture:
     from relit.capture import open_capture
 
     if job.capture == "duplicates":
+        if job.masks.startswith("segment:"):
+            from relit.capture.sfd import open_segmented
+
+            return open_segmented(path, job.masks.split(":", 1)[1], focal=job.focal, max_side=job.max_side)
         check_labels(path)
     sphere = None if job.sphere is None else Sphere(np.array(job.sphere[:3], dtype=np.float64), float(job.sphere[3]))
     least = {} if job.capture not in RECIPES else {"min_photos": getattr(recipe_of(job.capture), "LEAST_PHOTOS", 3)}
@@ -95,8 +99,9 @@ def check_labels(path: Path) -> None:
         name = path.stem if path.is_file() else "NAME"
         raise UserError(
             "no labels were found: which pixel belongs to which object is not known",
-            f"looked for {name}_labels.png, {name}_instance_seg.png, cutouts/ and COCO annotations beside the photo, and SfD's folders",
-            f"make a label image, one grey level for each object and black elsewhere (docs/duplicates.md): {path}",
+            f"looked for {name}_labels.png, {name}_instance_seg.png, cutouts/, COCO annotations, and the folders of SfD and BOP",
+            "make a label image, one grey level for each object and black elsewhere, or give a segmenter: --masks segment:FILE.onnx "
+            f"(docs/duplicates.md): {path}",
         )
 
 
@@ -120,6 +125,7 @@ BESIDE = (
     "cutouts",
     "cut-outs",
     "instances",
+    "mask_visib",
 )
 
 
@@ -131,7 +137,7 @@ def input_digests(capture: Capture) -> dict[str, str]:
     if capture.kind == "duplicates":
         from relit.capture.sfd import SUFFIXES
 
-        files |= {p for f in list(files) for p in f.parent.iterdir() if p.stem.endswith((*SUFFIXES, "_normal"))}
+        files |= {p for f in list(files) for p in f.parent.iterdir() if p.stem.endswith((*SUFFIXES, "_normal", "_normal_pretrain"))}
     for folder in BESIDE:
         files |= set((root / folder).rglob("*"))
     names = sorted(p.relative_to(root).as_posix() for p in files if p.is_file() and p.is_relative_to(root))

@@ -140,7 +140,7 @@ def test_cutouts(tmp_path):
         open_capture(path)
 
 
-def test_coco_polygons_andrun_lengths(tmp_path):
+def test_coco_polygons_and_run_lengths(tmp_path):
     path = photo(tmp_path)
     mask = (labels_of() == 100).astype(np.uint8)
     flat = mask.T.ravel()
@@ -161,7 +161,7 @@ def test_coco_polygons_andrun_lengths(tmp_path):
         open_capture(path)
 
 
-def test_compressedrun_lengths():
+def test_compressed_run_lengths():
     def compressed(runs):  # COCO's rleToString
         out = ""
         for i, run in enumerate(runs):
@@ -177,3 +177,59 @@ def test_compressedrun_lengths():
     assert uncompressed(compressed(runs)) == runs
     mask = run_lengths({"size": [5, sum(runs) // 5], "counts": compressed(runs)})
     assert mask.T.ravel()[:3].sum() == 0 and mask.T.ravel()[3:43].all()
+
+
+def test_several_photos_of_one_pile(tmp_path):
+    for k in range(3):
+        path = photo(tmp_path, f"p{k}.png")
+        cv2.imwrite(str(tmp_path / f"p{k}_labels.png"), labels_of(3 - k % 2))
+    photo(tmp_path, "other.png")  # has no labels
+    capture = open_capture(tmp_path, focal=150.0)
+    assert [p.name for p in capture.photos] == ["p0.png", "p1.png", "p2.png"] and capture.kind == "duplicates"
+    assert [len(np.unique(p.load().labels)) - 1 for p in capture.photos] == [3, 2, 3]
+    assert any("3 photos of one pile" in n for n in capture.notes) and any(n.startswith("p1.png: 2 objects") for n in capture.notes)
+    assert len(open_capture(path).photos) == 1  # one of them alone
+
+
+def test_cutouts_of_several_photos(tmp_path):
+    for k in range(2):
+        photo(tmp_path, f"p{k}.png")
+        (tmp_path / "cutouts" / f"p{k}").mkdir(parents=True)
+        alpha = np.where(labels_of() == 60 + 40 * k, 255, 0).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / "cutouts" / f"p{k}" / "0.png"), np.dstack([np.zeros((H, W, 3), np.uint8), alpha]))
+    first, second = (p.load().labels for p in open_capture(tmp_path).photos)
+    assert first[48, 30] == 1 and first[48, 78] == 0 and second[48, 78] == 1
+
+
+def bop(folder):
+    photo(folder / "rgb", "000004.png")
+    (folder / "mask_visib").mkdir()
+    for k in range(3):
+        mask = np.where(labels_of() == 60 + 40 * k, 255, 0).astype(np.uint8)
+        cv2.imwrite(str(folder / "mask_visib" / f"000004_{k:06d}.png"), mask)
+    pose = {"cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 700.0]}
+    (folder / "scene_gt.json").write_text(json.dumps({"4": [{"obj_id": o, **pose} for o in (5, 2, 5)]}))
+    (folder / "scene_camera.json").write_text(json.dumps({"4": {"cam_K": [210.0, 0, 79.5, 0, 210.0, 40.0, 0, 0, 1]}}))
+    return folder
+
+
+def test_bop_scene(tmp_path):
+    capture = open_capture(bop(tmp_path))
+    camera, labels = capture.photos[0].camera, capture.photos[0].load().labels
+    assert (camera.fx, camera.cx, camera.cy) == (210.0, 80.0, 40.5) and capture.photos[0].name == "rgb/000004.png"
+    assert labels[48, 30] == 1 and labels[48, 78] == 0 and labels[48, 126] == 3  # the second is another object
+    assert any("obj_id 5" in n for n in capture.notes)
+    (tmp_path / "mask_visib" / "000004_000002.png").unlink()
+    with pytest.raises(UserError, match="no usable mask"):
+        open_capture(tmp_path)
+    (tmp_path / "scene_gt.json").write_text('{"4": [{"id": 3}]}')
+    with pytest.raises(UserError, match="not as BOP"):
+        open_capture(tmp_path)
+
+
+def test_principal_point_and_size_of_a_transforms_file(tmp_path):
+    folder = sfd(tmp_path / "c")
+    data = json.loads((folder / "transforms_train.json").read_text())
+    (folder / "transforms_train.json").write_text(json.dumps({**data, "w": 2 * W, "h": 2 * H, "cx": 150.0, "cy": 100.0}))
+    camera = open_capture(folder).photos[0].camera
+    assert (camera.fx, camera.cx, camera.cy) == (123.5 / 2, 75.0, 50.0)

@@ -11,6 +11,7 @@ import pytest
 
 from relit.asset.asset import load_asset, save_asset
 from relit.asset.gltf import write_glb
+from relit.cameras.se3 import rotation_angle
 from relit.capture import open_capture
 from relit.capture.procedural import pawn
 from relit.capture.synthetic_duplicates import heap, synthesize_duplicates
@@ -18,6 +19,7 @@ from relit.conventions import scale_of, similarity
 from relit.errors import UserError
 from relit.evaluate.protocols import evaluate
 from relit.fit import duplicates as recipe
+from relit.fit import duplicates_poses as poses_stage
 from relit.images import write_linear
 from relit.run import Run
 
@@ -39,10 +41,10 @@ def pile(tmp_path_factory):
     return out
 
 
-def true_poses(pile):
-    """object_from_camera in a frame whose unit is the object's radius over .8."""
+def true_poses(pile, number=0):
+    """object_from_camera of the photo `number` in a frame whose unit is the object's radius over .8."""
     truth = json.loads((pile / "truth" / "truth.json").read_text())
-    camera = open_capture(pile).photos[0].camera
+    camera = open_capture(pile).photos[number].camera
     poses = []
     for i in truth["instances"]:
         m = np.linalg.inv(camera.world_from_camera) @ np.array(i["world_from_object"])
@@ -72,7 +74,7 @@ def test_objects_of_a_heap_stand_on_the_ground_and_hardly_in_one_another():
 
 
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
-    monkeypatch.setattr(recipe, "place", lambda views, search, **_: (true_poses(pile), np.full(len(views), 0.95)))
+    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (true_poses(pile), np.full(len(views), 0.95)))
     capture = open_capture(pile)
     assert capture.kind == "duplicates" and len(np.unique(capture.photos[0].load().labels)) == 5
     small = {"levels": (24,), "level_steps": (12,), "rays": 512, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
@@ -106,6 +108,46 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
         assert told[name]["value"] == pytest.approx(metrics[name]["value"], abs=1e-6)
 
 
+def test_two_photos_of_one_pile(tmp_path, monkeypatch):
+    write_glb(tmp_path / "pawn.glb", *pawn(rows=12, columns=16, texture=16))
+    write_linear(tmp_path / "light.exr", np.full((8, 16, 3), 0.7, np.float32))
+    sizes = {"count": 3, "photos": 2, "resolution": 80, "test_resolution": 16, "spp": 4, "test_spp": 4, "test_views": 1}
+    pile = synthesize_duplicates(tmp_path / "pawn.glb", tmp_path / "light.exr", tmp_path / "capture", **sizes)
+    capture = open_capture(pile)
+    assert len(capture.photos) == 2
+    told = np.concatenate([true_poses(pile, 0), true_poses(pile, 1)])
+    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (told, np.full(len(views), 0.95)))
+    small = {"levels": (24,), "level_steps": (6,), "rays": 256, "faces": 500, "texture": 32, "surface_steps": 2, "points": 64}
+    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48)
+    with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
+        asset = recipe.reconstruct(capture, run, options, 0)
+        log = (run.folder / "log.txt").read_text()
+    assert [i.label for i in asset.instances] == [85, 170, 255] and all(i.registered for i in asset.instances)
+    assert "photo 2 is turned by 35 degrees" in log and "3 instances in 2 photos" in log
+    (_, first), (_, second) = asset.cameras
+    true = [p.camera.world_from_camera for p in capture.photos]
+    assert np.allclose(first.world_from_camera, true[0])
+    wanted = true[0][:3, :3].T @ true[1][:3, :3]
+    assert rotation_angle((first.world_from_camera[:3, :3].T @ second.world_from_camera[:3, :3]).T @ wanted) < 4
+
+
+def test_one_object_in_several_photos_runs_and_says_what_it_is(pile, tmp_path, monkeypatch):
+    capture = open_capture(pile)
+    photo = capture.photos[0]
+    pixels = photo.load()
+    label = int(np.unique(pixels.labels[pixels.labels > 0])[0])
+    alone = replace(photo, load=lambda: replace(pixels, labels=np.where(pixels.labels == label, label, 0).astype(np.int32)))
+    told = true_poses(pile)[:1].repeat(2, 0)
+    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (told, np.full(len(views), 0.95)))
+    small = {"levels": (24,), "level_steps": (4,), "rays": 256, "faces": 500, "texture": 32, "surface_steps": 2, "points": 64}
+    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48, without=("matching",))
+    with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
+        asset = recipe.reconstruct(replace(capture, photos=(alone, alone)), run, options, 0)
+        log = (run.folder / "log.txt").read_text()
+    assert "one object in 2 photos" in log and "--capture multiview" in log
+    assert len(asset.instances) == 1 and len(asset.cameras) == 2
+
+
 def test_switched_off_parts_are_checked_by_name():
     with pytest.raises(ValueError, match="Did you mean 'refinement'"):
         replace(recipe.options_for("draft"), without=("refinment",))
@@ -113,9 +155,6 @@ def test_switched_off_parts_are_checked_by_name():
         recipe.options_for("fast")
 
 
-def test_a_photo_without_labels_and_several_photos_are_refused(pile):
-    capture = open_capture(pile)
+def test_a_photo_without_labels_is_refused(pile):
     with pytest.raises(UserError, match="no labels"):
-        recipe.one_photo(replace(capture, kind=""))
-    with pytest.raises(UserError, match="2 photos"):
-        recipe.one_photo(replace(capture, photos=capture.photos * 2))
+        recipe.labelled_photos(replace(open_capture(pile), kind=""))

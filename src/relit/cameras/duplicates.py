@@ -140,7 +140,7 @@ def verified(link: Link, a: Features, b: Features, camera: Camera, error: float,
     return Link(inliers[:, 0], inliers[:, 1], link.turn, rotation)
 
 
-def colmap_camera(camera: Camera):
+def colmap_camera(camera: Camera, number: int = 1):
     """The photo's pinhole camera for pycolmap, focal known."""
     pycolmap = load_pycolmap()
 
@@ -150,25 +150,32 @@ def colmap_camera(camera: Camera):
         height=int(camera.height),
         params=[camera.fx, camera.fy, camera.cx, camera.cy],
         has_prior_focal_length=True,
-        camera_id=1,
+        camera_id=number,
     )
 
 
-def link_instances(features: list[Features], camera: Camera, error: float, *, sweep: bool = True) -> dict[tuple[int, int], Link]:
+def each(camera: Camera | list[Camera], count: int) -> list[Camera]:
+    """A camera for each of `count` instances."""
+    return [camera] * count if isinstance(camera, Camera) else camera
+
+
+def link_instances(
+    features: list[Features], camera: Camera | list[Camera], error: float, *, sweep: bool = True
+) -> dict[tuple[int, int], Link]:
     """Links of the pairs (i < j) whose verified matches stand out from chance: at least CHANCE times as many as at turns a quarter, half
-    and three quarters of a circle away, where all are wrong. error: pixels."""
-    links = {}
+    and three quarters of a circle away, where all are wrong. camera: of the photo, or one for each instance. error: pixels."""
+    links, cameras = {}, each(camera, len(features))
     for i, j in combinations(range(len(features)), 2):
         a, b = features[i], features[j]
         link = match_pair(a, b, sweep)
-        link = None if link is None else verified(link, a, b, camera, error)
+        link = None if link is None else verified(link, a, b, cameras[i], error, cameras[j])
         if link is None:
             continue
         wrong = 0
         for away in (90, 180, 270):
             t = round((link.turn + away) / STEP) % len(b.descriptors)
             x, y = mutual(a.descriptors[0], b.descriptors[t])
-            control = verified(Link(x, y, 0.0), a, b, camera, error) if len(x) >= LEAST else None
+            control = verified(Link(x, y, 0.0), a, b, cameras[i], error, cameras[j]) if len(x) >= LEAST else None
             wrong = max(wrong, 0 if control is None else len(control.a))
         if len(link.a) >= CHANCE * max(wrong, LEAST / CHANCE):
             links[i, j] = link
@@ -176,7 +183,7 @@ def link_instances(features: list[Features], camera: Camera, error: float, *, sw
 
 
 def map_instances(
-    features: list[Features], links: dict[tuple[int, int], Link], camera: Camera, seed: int = 0
+    features: list[Features], links: dict[tuple[int, int], Link], camera: Camera | list[Camera], seed: int = 0
 ) -> list[dict[int, np.ndarray]]:
     """Clusters of instances that the links place in one frame, largest first: index -> camera_from_object (4, 4), each cluster in a frame
     and scale of its own. The focal length is fixed."""
@@ -187,8 +194,11 @@ def map_instances(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "database.db"
         with pycolmap.Database.open(path) as db:
-            number = db.write_camera(colmap_camera(camera), use_camera_id=True)
-            for k, f in enumerate(features):
+            numbers: dict[int, int] = {}
+            for k, (f, own) in enumerate(zip(features, each(camera, len(features)), strict=True)):
+                if id(own) not in numbers:
+                    numbers[id(own)] = db.write_camera(colmap_camera(own, len(numbers) + 1), use_camera_id=True)
+                number = numbers[id(own)]
                 db.write_image(pycolmap.Image(name=f"{k:05d}", camera_id=number, image_id=k + 1), use_image_id=True)
                 db.write_keypoints(k + 1, f.points.astype(np.float32))
             for (i, j), link in links.items():

@@ -20,12 +20,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from relit.capture.frames import pose_from, read_json
+from relit.capture.frames import image_folder, list_images, pose_from, read_json
 from relit.capture.labels import BOP_TRUTH, bop_object, checked_labels, read_labels
+from relit.capture.networks import found_instances, load_network
 from relit.capture.photo import Decoder
 from relit.conventions import world_from_cv_camera
 from relit.errors import UserError
-from relit.images import EXTENSIONS, Header, read_header
+from relit.images import EXTENSIONS, Header, read_header, read_image
 from relit.scene import Camera, Capture, Photo, Pixels
 
 SUFFIXES = ("_instance_seg", "_labels", "_instances", "_seg")
@@ -141,6 +142,23 @@ def open_duplicates(source: Source, *, focal: float | None = None, max_side: int
     if source.more:
         notes.append(f"{len(photos)} photos of one pile: nothing must stir between them")
     return Capture(source.root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates")
+
+
+def open_segmented(path: Path, network: str, *, focal: float | None = None, max_side: int | None = None) -> Capture:
+    """As `open_duplicates` for a photo, or a folder of photos of one pile, whose labels an ONNX network finds (`capture.networks`)."""
+    files = [path]
+    if path.is_dir():
+        files = [f for f in list_images(image_folder(path) or path) if _is_photo(f)][:MOST_PHOTOS]
+    if not files or not files[0].is_file():
+        raise UserError("no photo was found", fix=f"give a photo or a folder of photos: {path}")
+    root = path if path.is_dir() else path.parent
+    source, notes, photos = Source(root, files[0], Path(network), _cameras(root)), [], []
+    segmenter = load_network(network)
+    for file in files:
+        labels, dropped = checked_labels(found_instances(segmenter, read_image(file).rgb), file)
+        notes += [*dropped, f"{file.name}: {len(np.unique(labels[labels > 0]))} objects found by {Path(network).name}; look at them"]
+        photos.append(labelled_photo(source, file, read_header(file), labels, focal, max_side, notes))
+    return Capture(root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates")
 
 
 def labelled_photo(

@@ -1,7 +1,7 @@
-"""One photo of a pile of identical objects, with its truth, in the layout of SfD's released data.
+"""One photo, or several, of a pile of identical objects, with its truth, in the layout of SfD's released data.
 
     transforms_train.json         focal (pixels) and the camera's pose
-    train/000_rgb.png             the photo, 8-bit sRGB
+    train/000_rgb.png             the photo, 8-bit sRGB (001_rgb.png ... where there are several)
     train/000_instance_seg.png    one grey level for each object, 0 for the rest
     truth/truth.json              poses, visible shares, ground, settings; written last
     truth/mesh.ply  truth/environment.exr
@@ -30,6 +30,7 @@ from relit.scene import Camera, Ground, Mesh
 VERSION = 1
 FOV = 38.0  # degrees, the shorter side of the photo
 ELEVATION = 55.0  # degrees, of the photo's camera
+STEP = 35.0  # degrees around the pile from one photo to the next
 TEST_ELEVATIONS = (38.0, 58.0)  # of the novel views, in turn
 CELL = RADIUS / 20  # of the height field that objects drop onto
 GROUND_COLOUR, GROUND_ROUGHNESS = (0.36, 0.33, 0.30), 0.8
@@ -41,6 +42,7 @@ def synthesize_duplicates(
     out: str | Path,
     *,
     count: int = 10,
+    photos: int = 1,
     test_views: int = 8,
     relights: Sequence[str | Path] = (),
     resolution: int = 1600,
@@ -58,9 +60,10 @@ def synthesize_duplicates(
 ) -> Path:
     """Render one photo of `count` copies of an object under one light, with its truth, into `out`; returns `out`.
 
-    lean: standard deviation in degrees of the tilt away from the resting pose. spread: factor on the radius of the pile. nodes: names of
-    the glTF nodes whose meshes are taken, all where empty. Others: as `synthesize_multiview`. Deterministic by `seed`; a
-    call with the same settings takes up where a stopped one was. Raises UserError when a file cannot be read or a number makes no sense.
+    photos: of the same pile, STEP degrees apart around it; their labels agree. lean: standard deviation in degrees of the tilt away from
+    the resting pose. spread: factor on the radius of the pile. nodes: names of the glTF nodes whose meshes are taken, all where empty.
+    Others: as `synthesize_multiview`. Deterministic by `seed`; a call with the same settings takes up where a stopped one was. Raises
+    UserError when a file cannot be read or a number makes no sense.
     """
     options = {k: v for k, v in locals().items() if k in synthesize_duplicates.__kwdefaults__ and k not in ("say", "relights")}
     asset_file, light_file, out = Path(asset_file), Path(light_file), Path(out)
@@ -80,7 +83,9 @@ def synthesize_duplicates(
     poses, reach = heap(mesh, count, seed, lean, spread)
     ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 5 * reach, np.array(GROUND_COLOUR), GROUND_ROUGHNESS)
     pile = build_pile(mesh, material, poses, ground)
-    camera = pile_camera(reach, resolution, np.random.default_rng(seed + 17).uniform(0, 360), ELEVATION)
+    first = np.random.default_rng(seed + 17).uniform(0, 360)
+    shots = [pile_camera(reach, resolution, first + STEP * k, ELEVATION) for k in range(photos)]
+    camera = shots[0]
     tests = test_cameras(reach, test_views, test_resolution, seed)
     truth = out / "truth"
 
@@ -92,13 +97,15 @@ def synthesize_duplicates(
 
     scene, environment = lit(light_file)
     write_linear(truth / "environment.exr", environment)
-    labels = instance_ids(scene, pile, camera) + 1
     levels = np.concatenate([[0], np.round(np.arange(1, count + 1) * 255 / count)]).astype(np.uint8)
     (out / "train").mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(out / "train" / "000_instance_seg.png"), levels[labels])
-    say(f"photo of {count} objects, {resolution} x {resolution}")
-    if not (out / "train" / "000_rgb.png").exists():
-        write_srgb(out / "train" / "000_rgb.png", np.clip(radiance(scene, camera, spp, max_depth, seed)[..., :3], 0, 1))
+    labels = instance_ids(scene, pile, camera) + 1
+    for k, shot in enumerate(shots):
+        ids = labels if k == 0 else instance_ids(scene, pile, shot) + 1
+        cv2.imwrite(str(out / "train" / f"{k:03d}_instance_seg.png"), levels[ids])
+        if not (out / "train" / f"{k:03d}_rgb.png").exists():
+            write_srgb(out / "train" / f"{k:03d}_rgb.png", np.clip(radiance(scene, shot, spp, max_depth, seed + 7 * k)[..., :3], 0, 1))
+        say(f"photo {k + 1} of {photos} of {count} objects, {resolution} x {resolution}")
     for i, (name, view) in enumerate(tests):
         target = truth / "test" / f"{name}.exr"
         if not target.exists():
@@ -120,7 +127,7 @@ def synthesize_duplicates(
                 write_linear(target, render(scene, view, spp=test_spp, seed=seed + 90 + 40 * j + i, max_depth=max_depth))
         say(f"test views under {file.stem}")
     _write_mesh(truth / "mesh.ply", mesh)
-    _write_json(out / "transforms_train.json", _cameras([("train/000", camera)]))
+    _write_json(out / "transforms_train.json", _cameras([(f"train/{k:03d}", c) for k, c in enumerate(shots)]))
     _write_json(out / "transforms_test.json", _cameras([(f"test/{n}", c) for n, c in tests]))
     _write_json(
         truth / "truth.json",
@@ -156,7 +163,14 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
 def _check(o: dict, relights: list[Path]) -> None:
     if len({f.stem for f in relights}) < len(relights):
         raise UserError("two relighting files have one name", "the truth is kept by name", "rename one of them")
-    limits = {"count": (1, 255), "test_views": (1, 1000), "resolution": (32, 8192), "test_resolution": (8, 8192), "spp": (1, 1 << 20)}
+    limits = {
+        "count": (1, 255),
+        "photos": (1, 12),
+        "test_views": (1, 1000),
+        "resolution": (32, 8192),
+        "test_resolution": (8, 8192),
+        "spp": (1, 1 << 20),
+    }
     for name, (low, high) in limits.items():
         if not low <= o[name] <= high:
             raise UserError(f"{name} = {o[name]} is outside {low} to {high}", code=2)

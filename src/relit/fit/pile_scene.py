@@ -15,7 +15,7 @@ from relit.rendering.pile import ground_square
 from relit.scene import Camera, Ground, Mesh
 
 TOUCHES = 0.08  # unit lengths within which an instance counts as touching the ground
-SETTLED = 5  # instances that must touch the ground before their distances follow it
+SETTLED = 4  # instances that must touch the ground before their distances follow it
 FARTHEST = 0.02  # of its distance that an instance is moved at most
 TILT = 5.0  # degrees that the ground may turn meanwhile
 GROUND_ROWS = 96
@@ -142,11 +142,11 @@ def light_below(environment: np.ndarray, up: np.ndarray, radiance: np.ndarray) -
     return (environment * (1 - below) + radiance * below).astype(np.float32)
 
 
-def photo_bank(pixels, camera: Camera, labels: set[int], max_pixels: int):
-    """The pixels of the photo that lie inside an instance of `labels`, one pixel off its border; every n-th where there are more than
-    max_pixels."""
-    solid = (minimum_filter(pixels.labels, 3) == pixels.labels) & np.isin(pixels.labels, list(labels))
-    bank = make_bank([camera], [pixels.rgb], [solid.astype(np.float32)], radius=1e6)
-    inside = np.flatnonzero(solid.ravel()).astype(np.uint32)
+def photo_bank(photos: list, cameras: list[Camera], labels: list[set[int]], max_pixels: int):
+    """The pixels of the photos that lie inside an instance of their `labels`, one pixel off its border; every n-th where there are more
+    than max_pixels."""
+    solid = [(minimum_filter(p.labels, 3) == p.labels) & np.isin(p.labels, list(own)) for p, own in zip(photos, labels, strict=True)]
+    bank = make_bank(cameras, [p.rgb for p in photos], [s.astype(np.float32) for s in solid], radius=1e6)
+    inside = np.flatnonzero(np.concatenate([s.ravel() for s in solid])).astype(np.uint32)
     bank.candidates = mi.UInt32(inside[:: max(1, len(inside) // max_pixels)])
     return bank

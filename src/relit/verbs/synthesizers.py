@@ -162,6 +162,7 @@ def duplicates_flags(parser: Parser) -> None:
     add("--light", required=True, type=Path, nargs="+", metavar="FILE", help="lat-long .hdr or .exr")
     add("--relight", type=Path, nargs="*", default=[], metavar="FILE", help="other lights, for the truth of relighting")
     add("--count", type=int, default=10, help="objects in the photo (default 10)")
+    add("--photos", type=int, default=1, help="photos of the pile (default 1)")
     add("--test-views", type=int, default=8, help="novel views of the pile (default 8)")
     more("--resolution", type=int, default=1600, help="pixels a side of the photo (default 1600)")
     more("--test-resolution", type=int, default=400, help="pixels a side of the novel views (default 400)")
@@ -187,6 +188,7 @@ def duplicates(args) -> None:
         args.light[0],
         args.out,
         count=args.count,
+        photos=args.photos,
         test_views=args.test_views,
         relights=args.relight,
         resolution=args.resolution,

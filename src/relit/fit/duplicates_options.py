@@ -1,0 +1,80 @@
+"""Settings of the recipe `duplicates`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from relit.errors import UserError, did_you_mean
+from relit.lighting.spherical_gaussians import MAX_LOBES
+
+
+@dataclass(frozen=True)
+class DuplicatesOptions:
+    """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for all poses. levels, level_steps, rays:
+    of the volume pass. refine_poses: step of the pose corrections in it (radians, unit lengths). faces, texture: of the object.
+    surface_steps, points, directions, light: of the surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for
+    a map. max_pixels: of the photos. matcher: 'module:function', see `cameras.matcher`. normal_network: an ONNX file, see
+    `capture.networks`. without: parts that are switched off, names of WITHOUT.
+    """
+
+    side: int = 320
+    search_rounds: int = 1
+    levels: tuple[int, ...] = (64, 128)
+    level_steps: tuple[int, ...] = (400, 500)
+    rays: int = 6144
+    refine_poses: float = 0.004
+    faces: int = 16_000
+    texture: int = 512
+    surface_steps: int = 900
+    points: int = 4096
+    directions: int = 48
+    light: int = 64
+    gaussians: int = 0
+    max_pixels: int = 4_000_000
+    matcher: str = ""
+    normal_network: str = ""
+    without: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if not 0 <= self.gaussians <= MAX_LOBES:
+            raise ValueError(f"gaussians={self.gaussians} is outside 0 to {MAX_LOBES}")
+        for name in self.without:
+            if name not in WITHOUT:
+                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+
+
+WITHOUT = {
+    "rotation_sweep": "pictures are matched as they are, not turned against each other",
+    "matching": "no features are matched",
+    "search": "what matching does not link is dropped",
+    "refinement": "poses stay as search has found them",
+    "visibility": "no instance, and no ground, shadows another",
+    "normals": "normal priors are not used",
+    "metal": "no term pulls metallic to 0 or 1",
+    "ground": "no ground is looked for",
+}
+
+PRESETS = {
+    "draft": {
+        "side": 200,
+        "levels": (48, 96),
+        "level_steps": (150, 200),
+        "rays": 4096,
+        "faces": 8_000,
+        "texture": 256,
+        "surface_steps": 300,
+        "points": 2048,
+        "directions": 32,
+        "light": 32,
+        "max_pixels": 1_000_000,
+    },
+    "standard": {},
+    "high": {"side": 480, "levels": (96, 192), "level_steps": (500, 700), "texture": 1024, "surface_steps": 2500, "directions": 64},
+}
+
+
+def options_for(quality: str) -> DuplicatesOptions:
+    """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
+    if quality not in PRESETS:
+        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
+    return DuplicatesOptions(**PRESETS[quality])

@@ -1,0 +1,114 @@
+"""The first stage of the recipe `duplicates`: the views of all photos, and where each instance stands.
+
+Instances of several photos of one pile are views of the same object like those of one photo: all are registered together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from relit.errors import EXIT_FAILED, UserError
+from relit.fit.duplicates_options import DuplicatesOptions
+from relit.fit.instance_search import Search, place
+from relit.fit.instances import COARSE, View, carved, views_of
+from relit.scene import Camera, Pixels
+
+AGREES = 0.2  # an instance whose score lies further below the median did not find its place
+
+Shot = tuple[Pixels, Camera]  # a decoded photo and its camera in its own frame (identity pose)
+
+
+def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[View]:
+    """The views of all photos, in windows of at most `side` pixels."""
+    out = []
+    for number, (pixels, camera) in enumerate(shots):
+        normal = None if "normals" in options.without else pixels.normal
+        out += views_of(pixels.rgb, pixels.labels, camera, side, normal, number)
+    return out
+
+
+def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
+    """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,)) of all views, in the unit frame of the object."""
+    from relit.fit.multiview import run_arrays
+
+    if run.done("poses"):
+        saved = run_arrays(run, "poses", "poses")
+        return saved["poses"], saved["registered"], saved["labels"]
+    views = all_views(shots, COARSE, options)
+    with run.stage("poses", title="poses of the instances") as stage:
+        links = () if "matching" in options.without else links_of(shots, run, options, seed)
+        search = Search(rounds=options.search_rounds, **({"descents": 0} if "refinement" in options.without else {}))
+        try:
+            poses, scores = place(views, search, seed=seed, links=links, say=run.say)
+        except ValueError:
+            raise UserError(
+                "no poses of the instances fit together",
+                "the objects are not identical, the labels are wrong, or too few are seen from near-by sides",
+                "check the label image; more instances, or a photo in which they are larger, help",
+                code=EXIT_FAILED,
+            ) from None
+        registered = scores >= np.median(scores) - AGREES
+        linked = {i for link in links for i in link[:2]}
+        if "search" in options.without and len(views) > 1:
+            registered &= np.array([k in linked for k in range(len(views))])
+        if registered.sum() < min(2, len(views)):
+            raise UserError("hardly any instance could be placed", "see the scores in the log", "check the label image", code=EXIT_FAILED)
+        for k in np.flatnonzero(~registered):
+            run.say(f"note: the object with {named(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only")
+        if len(views) > 1 and scores[registered].std() < 0.004 and scores.min() > 0.97:
+            run.say("note: all poses fit equally well: a symmetric or textureless object leaves them ambiguous")
+        poses = centred(views, poses, registered)
+        keys = np.array([v.key for v in views])
+        stage.save("poses", poses=poses, registered=registered, labels=keys, scores=scores)
+    return poses, registered, keys
+
+
+def named(view: View) -> str:
+    """How messages call an instance."""
+    return f"label {view.label}" + (f" in photo {view.photo + 1}" if view.photo else "")
+
+
+def links_of(shots: list[Shot], run, options: DuplicatesOptions, seed: int) -> tuple:
+    """Links of pairs by rotation-swept feature matching: (i, j, rotation of i onto j in the photo)."""
+    from relit.cameras.duplicates import find_features, link_instances, map_instances
+    from relit.cameras.matcher import link_by_matcher, load_matcher
+    from relit.cameras.sfm import _quiet
+    from relit.device import load_pycolmap
+
+    full = all_views(shots, 10**6, options)
+    cameras = [shots[v.photo][1] for v in full]
+    offsets = [(c.cx - v.camera.cx, c.cy - v.camera.cy) for v, c in zip(full, cameras, strict=True)]
+    error = max(0.5, float(np.median([max(v.mask.shape) for v in full])) / 250)
+    sweep = "rotation_sweep" not in options.without
+    windows = [(v.rgb, v.mask, offset) for v, offset in zip(full, offsets, strict=True)]
+    with _quiet(load_pycolmap()):
+        if options.matcher:
+            features, links = link_by_matcher(load_matcher(options.matcher), windows, cameras, error, sweep=sweep)
+        else:
+            features = [find_features(*w) for w in windows]
+            links = link_instances(features, cameras, error, sweep=sweep)
+        clusters = map_instances(features, links, cameras, seed)
+    for i, j in links:
+        count, turn = len(links[i, j].a), links[i, j].turn
+        run.log.note(f"{count} matches link {named(full[i])} and {named(full[j])}, turned by {turn:.0f} degrees")
+    out, together = [], set()
+    for cluster in clusters:
+        members = sorted(cluster)
+        run.say(f"matching links the instances {', '.join(named(full[k]).removeprefix('label ') for k in members)}")
+        together |= {(i, j) for i in members for j in members if i < j}
+        out += [(i, j, cluster[j][:3, :3] @ cluster[i][:3, :3].T) for i in members for j in members if i < j]
+    out += [(i, j, link.rotation) for (i, j), link in links.items() if link.rotation is not None and (i, j) not in together]
+    return tuple(out)
+
+
+def centred(views: list[View], poses: np.ndarray, registered: np.ndarray) -> np.ndarray:
+    """The poses in a frame whose unit sphere holds the object: its middle at the origin, its farthest point at 0.85."""
+    chosen = [k for k in range(len(views)) if registered[k]]
+    inside = carved([views[k] for k in chosen], poses[chosen], 64, 0.2)
+    z, y, x = np.nonzero(inside < 0)
+    p = np.stack([x, y, z], -1) * (2 / 63) - 1
+    middle = (p.min(0) + p.max(0)) / 2
+    s = 0.85 / np.linalg.norm(p - middle, axis=1).max()
+    out = poses.copy()
+    out[:, :3, 3] = s * (poses[:, :3, 3] - middle)
+    return out

@@ -1,0 +1,77 @@
+"""Networks that a user brings: segmenters and normal priors, ONNX files made here."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from tiny_onnx import write_pointwise
+
+from relit.capture.networks import MEAN, SPREAD, found_instances, load_network, predicted_normals
+from relit.errors import UserError
+from relit.plan import Job, open_as
+
+W, H = 160, 96
+
+
+def two_discs(folder):
+    picture = np.full((H, W, 3), 90, np.uint8)
+    cv2.circle(picture, (40, 48), 25, (10, 10, 240), -1)  # red
+    cv2.circle(picture, (115, 50), 30, (240, 10, 10), -1)  # blue
+    cv2.imwrite(str(folder / "photo.png"), picture)
+    return folder / "photo.png"
+
+
+def segmenter(file):
+    """Masks as logits: red against blue, and blue against red."""
+    weight = 8 * np.array([[1.0, 0, -1], [-1, 0, 1]])
+    shift = weight @ (np.array(MEAN) / SPREAD)  # the network sees (x - MEAN) / SPREAD
+    return write_pointwise(file, weight, [shift[0] - 8, shift[1] - 8])
+
+
+def test_a_photo_without_labels_and_a_segmenter(tmp_path):
+    path, network = two_discs(tmp_path), segmenter(tmp_path / "segmenter.onnx")
+    capture, kind = open_as(path, Job(capture="duplicates", masks=f"segment:{network}", focal=200.0))
+    labels = capture.photos[0].load().labels
+    assert kind == "duplicates" and set(np.unique(labels)) == {0, 1, 2}
+    assert labels[48, 40] == 1 and labels[50, 115] == 2 and labels[5, 80] == 0
+    assert abs((labels == 2).sum() - np.pi * 30**2) < 250
+    assert any("2 objects found by segmenter.onnx" in n for n in capture.notes)
+    folder, _ = open_as(tmp_path, Job(capture="duplicates", masks=f"segment:{network}", focal=200.0))
+    assert len(folder.photos) == 1
+
+
+def test_without_a_segmenter_it_is_named_in_the_way_out(tmp_path):
+    with pytest.raises(UserError, match="no labels") as error:
+        open_as(two_discs(tmp_path), Job(capture="duplicates"))
+    assert "segment:FILE.onnx" in str(error.value)
+
+
+def test_numbers_of_a_panoptic_segmenter(tmp_path):
+    network = load_network(write_pointwise(tmp_path / "numbers.onnx", np.array([[0.0, 0, 0]]), [3.0]))
+    assert (found_instances(network, np.zeros((H, W, 3), np.float32)) == 3).all()
+    nothing = load_network(write_pointwise(tmp_path / "nothing.onnx", np.array([[0.0, 0, 0]]), [0.0]))
+    with pytest.raises(UserError, match="finds no object"):
+        found_instances(nothing, np.zeros((H, W, 3), np.float32))
+
+
+@pytest.mark.parametrize("coded", [False, True])
+def test_predicted_normals_are_turned_to_the_cameras_axes(tmp_path, coded):
+    up_and_near = np.array([0.0, 0.6, 0.8])
+    bias = up_and_near * 0.5 + 0.5 if coded else up_and_near - np.array([1e-3, 0, 0])
+    network = load_network(write_pointwise(tmp_path / "normals.onnx", np.zeros((3, 3)), bias))
+    labels = np.zeros((H, W), np.int32)
+    cv2.circle(labels, (40, 48), 25, 7, -1)
+    normal = predicted_normals(network, np.full((H, W, 3), 0.3, np.float32), labels)
+    assert np.allclose(normal[labels == 7], [0, -0.6, -0.8], atol=0.01) and (normal[labels == 0] == 0).all()
+
+
+def test_wrong_networks_are_named(tmp_path):
+    with pytest.raises(UserError, match="no network at"):
+        load_network(tmp_path / "none.onnx")
+    (tmp_path / "bad.onnx").write_bytes(b"\x08\x08not a network")
+    with pytest.raises(UserError, match="cannot be read"):
+        load_network(tmp_path / "bad.onnx")
+    two = load_network(write_pointwise(tmp_path / "two.onnx", np.zeros((2, 3)), [0.0, 1.0]))
+    with pytest.raises(UserError, match="normals"):
+        predicted_normals(two, np.zeros((H, W, 3), np.float32), np.ones((H, W), np.int32))
