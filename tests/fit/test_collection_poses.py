@@ -72,7 +72,8 @@ def test_only_the_lost_photo_moves(model, photos):
 
 
 def test_ablation_without_search_keeps_the_hints(photos):
-    from relit.fit.collection_poses import even_colours, find_poses, schedule_of
+    from relit.fit.collection_growth import find_poses
+    from relit.fit.collection_poses import even_colours, schedule_of
     from relit.fit.register import crop_photo
 
     crops = even_colours([crop_photo(*p) for p in photos])
@@ -95,20 +96,21 @@ def test_agreement_tells_right_poses_from_wrong_ones(photos):
 
 
 def test_settling_never_ends_worse_than_it_began(photos, monkeypatch):
-    from relit.fit import collection_poses
+    from relit.fit import collection_growth
+    from relit.fit.collection_poses import even_colours
     from relit.fit.register import crop_photo, crop_rings
 
-    crops = collection_poses.even_colours([crop_photo(*p) for p in photos])
+    crops = even_colours([crop_photo(*p) for p in photos])
     poses, scores = np.array([c.world_from_camera for *_, c in photos]), np.full(len(crops), 0.9)
     means = iter([0.5, 0.95, 0.7])
-    monkeypatch.setattr(collection_poses, "coarse_model", lambda *_: None)
-    monkeypatch.setattr(collection_poses, "volume_render", lambda _: None)
-    monkeypatch.setattr(collection_poses, "make_gallery", lambda *_: None)
-    monkeypatch.setattr(collection_poses, "search", lambda *_, **__: None)
-    monkeypatch.setattr(collection_poses, "best_refined", lambda *_: (poses, np.full(len(crops), next(means))))
+    monkeypatch.setattr(collection_growth, "coarse_model", lambda *_: None)
+    monkeypatch.setattr(collection_growth, "volume_render", lambda _: None)
+    monkeypatch.setattr(collection_growth, "make_gallery", lambda *_: None)
+    monkeypatch.setattr(collection_growth, "search", lambda *_, **__: None)
+    monkeypatch.setattr(collection_growth, "best_refined", lambda *_: (poses, np.full(len(crops), next(means))))
     rings = crop_rings(crops)
-    _, kept = collection_poses.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
+    _, kept = collection_growth.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
     assert kept.mean() == pytest.approx(0.95)
     means = iter([0.5, 0.6, 0.7])
-    _, kept = collection_poses.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
+    _, kept = collection_growth.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
     assert kept.mean() == pytest.approx(0.9)

@@ -23,11 +23,12 @@ import numpy as np
 from relit.cameras.links import Group
 from relit.conventions import similarity
 from relit.errors import UserError
+from relit.fit.collection_growth import find_poses
 from relit.fit.collection_held_out import held_out_stage, look_again
 from relit.fit.collection_links import links_stage, poses_from_links, with_focals
 from relit.fit.collection_options import CollectionOptions, options_for
 from relit.fit.collection_photos import Shot, crops_of, load_shots
-from relit.fit.collection_poses import GREY, agreement, find_poses, schedule_of
+from relit.fit.collection_poses import GREY, agreement, schedule_of
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, posterior, start_collection_surface
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras

@@ -1,0 +1,148 @@
+"""Where each photo of a collection was taken from when nothing is known: the shape grows from one photo outward.
+
+The model starts as one inflated silhouette: only viewpoints near those that it has seen are trusted, the photos that match best join first.
+Several photos are tried as the beginning; those that others agree with least are dropped early.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from relit.fit.collection_poses import (
+    HOPELESS,
+    PARTS,
+    Schedule,
+    best_refined,
+    coarse_model,
+    gauge,
+    polish,
+    pose_towards,
+    poses_from_hints,
+)
+from relit.fit.register import (
+    Crop,
+    crop_rings,
+    crop_views,
+    directions_around,
+    make_gallery,
+    near,
+    refine,
+    search,
+    views_from,
+    volume_render,
+)
+from relit.geometry.sdf import node_positions
+from relit.scene import Camera
+
+
+def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarray:
+    """(n, n, n) bool: where the object may be when one photo was seen from `camera`: as thick as its outline is far."""
+    p = node_positions(nodes).reshape(-1, 3)
+    to_outline = distance_transform_edt(crop.mask > 0.5) * (np.linalg.norm(camera.centre) / camera.fx)
+    q = camera.project(p)
+    u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
+    ok = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    limit = np.zeros(len(p))
+    limit[ok] = np.minimum(to_outline[v[ok], u[ok]] * 1.4, 0.6)
+    depth = np.abs(p @ camera.world_from_camera[:3, 2])
+    return (depth < limit * loosen + 0.03).reshape(nodes, nodes, nodes)
+
+
+def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=None, nodes: int = 40):
+    """Poses (P, 4, 4) and scores (P,) from one photo on: round i registers all photos and keeps the sizes[i] best for the next model."""
+    rings = crop_rings(crops, PARTS) if rings is None else rings
+    poses = np.array([pose_towards(c, np.array([0.0, 0.0, 1.0])) for c in crops])
+    used, scores = [first], np.zeros(len(crops))
+    anchor = poses[first]
+    for i, size in enumerate(sizes):
+        some = [crops[k] for k in used]
+        centres = np.array([poses[k][:3, 3] / np.linalg.norm(poses[k][:3, 3]) for k in used])
+        spread = np.degrees(np.arccos(np.clip((centres @ centres[used.index(first)]).min(), -1, 1)))
+        camera = crop_views([crops[first]], anchor[None])[0]
+        limit = inflated(crops[first], camera, nodes, 1 + spread / 40) if spread < 75 else None
+        tolerance = 0.4 if len(used) < 5 else 0.2 if i < len(sizes) - 2 else 0.12
+        model = coarse_model(some, poses[used], nodes, 60 if len(used) < 10 else 90, tolerance, seed + i, limit)
+        render = volume_render(model)
+        gallery = make_gallery(render, views_from(directions_around(400, seed + i)), PARTS)
+        seen = near(gallery, centres, 55).any(0)
+        found = search(crops, gallery, 1, rings=rings, allowed=np.tile(seen, (len(crops), 1)))
+        poses, scores = found.poses[:, 0], found.scores[:, 0]
+        if i >= 4:
+            poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 4.0, 2.0), parts=PARTS)
+        poses = gauge(crops, poses)
+        used = sorted(set(np.argsort(-scores)[:size].tolist()) | {first})
+        say(f"grown from photo {first}: {len(used)} of {len(crops)} photos, mean score {scores[used].mean():.3f}", poses, scores)
+        anchor = poses[first]
+    return poses, scores
+
+
+def find_poses(
+    crops, directions, degrees: float, schedule: Schedule, keep: int, starts: int, without, seed: int, say, cycles: int = 0, linked=None
+):
+    """Poses (P, 4, 4) and scores (P,), from hints where half of the photos have them, else by growth. cycles: of `polish` after that.
+    without: names of `collection.WITHOUT`. linked: (poses, scores, held) of `collection_links.poses_from_links`, which then come first."""
+    hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
+    keep = 1 if "multiplex" in without else keep
+    if "search" in without:
+        front = np.array([0.0, 0.0, 1.0])
+        poses = [pose_towards(c, d if d.any() else front) for c, d in zip(crops, directions, strict=True)]
+        return np.array(poses), np.ones(len(crops))
+
+    def tell(text, *_):
+        say(text)
+
+    held = None
+    if linked is not None:
+        poses, scores, held = linked
+    elif hinted >= 0.5:
+        poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep)
+    else:
+        poses, scores = poses_by_growth(crops, starts, keep, seed, tell)
+    return polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held) if cycles > 0 else (poses, scores)
+
+
+def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
+    """Grow from several photos for a few rounds, go on with the one that agrees best, and settle with all photos."""
+    rings, count = crop_rings(crops, PARTS), len(crops)
+    first = start_photos(crops, rings, starts)
+    early = sorted({min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2)})
+    tried = []
+    for photo in first:
+        state = grow(crops, photo, early, seed, say, rings)
+        tried.append((float(np.mean(np.sort(state[1])[-early[-1] :])), photo))
+    score, best = max(tried)
+    if score < HOPELESS:
+        raise ValueError(f"from none of {len(tried)} photos could a shape be grown that others agree with (best score {score:.2f})")
+    late = [min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2, 0.27, 0.37, 0.47, 0.57, 0.75, 1, 1, 1)]
+    poses, scores = grow(crops, best, late, seed, say, rings)
+    return settle(crops, poses, scores, rings, keep, seed, say)
+
+
+def start_photos(crops: list[Crop], rings, count: int) -> list[int]:
+    """Photos to start from: seen large and unlike each other, by the descriptors' own distances."""
+    from relit.fit.register import all_scores
+
+    alike = all_scores(rings, rings).max(2)
+    chosen = [int(np.argsort(-alike.mean(1))[0])]  # the one most like the others
+    while len(chosen) < min(count, len(crops)):
+        gain = alike.mean(1) - 0.7 * alike[:, chosen].max(1)
+        gain[chosen] = -np.inf
+        chosen.append(int(gain.argmax()))
+    return chosen
+
+
+def settle(crops: list[Crop], poses: np.ndarray, scores: np.ndarray, rings, keep: int, seed: int, say, rounds: int = 3):
+    """A few rounds with all photos and no restriction on the viewpoints; the best on average counts, be it the beginning: a handful of
+    photos is worse off without restriction."""
+    best = (float(scores.mean()), poses, scores)
+    for i in range(rounds):
+        model = coarse_model(crops, gauge(crops, poses), 48, 120, 0.12, seed + 100 + i)
+        render = volume_render(model)
+        gallery = make_gallery(render, views_from(directions_around(500, seed + 100 + i)), PARTS)
+        found = search(crops, gallery, keep, rings=rings)
+        poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1)
+        say(f"settling, round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
+        if scores.mean() > best[0]:
+            best = (float(scores.mean()), poses, scores)
+    return gauge(crops, best[1]), best[2]
