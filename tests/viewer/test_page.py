@@ -228,10 +228,10 @@ def test_a_run_at_work(drive, built, asset, tmp_path):
             for i in range(1, 101):
                 stage._written = -1.0
                 stage.step(i, image=1.0 / i)
-            stage.preview("view", np.full((8, 8, 3), 0.5, np.float32))
+            stage.preview(lambda: np.full((8, 8, 3), 0.5, np.float32))
             server = serve(lambda: run_server(tmp_path / "run"))
             text = "document.getElementById('live').textContent"
-            shown = "document.querySelectorAll('.curve').length + document.querySelectorAll('.previews img').length"
+            shown = "document.querySelectorAll('.curve').length + document.querySelectorAll('.preview img').length"
             steps = [{"wait": "document.querySelector('.curve')"}, {"eval": text}, {"eval": shown}]
             said, count = drive(server.url, steps)
             assert "cameras from photos" in said and "volume: step 100 of 400" in said and "left in this stage" in said

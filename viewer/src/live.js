@@ -45,7 +45,10 @@ export function showLive(panel, manifest, finished) {
     if (!status.running && !status.asset) rows.push(element("p", {}, "no process works on this run; the same relit reconstruct command takes it up again"));
     for (const { stage, name, points } of status.curves)
       if (points.length > 1) rows.push(element("p", {}, `${stage}, ${name}: ${points.at(-1)[1].toPrecision(3)}`), curve(points));
-    rows.push(element("div", { class: "previews" }, ...status.previews.map((p) => element("img", { src: p.url, alt: p.name, title: p.name }))));
+    for (const p of status.previews) {
+      const said = `${p.name}: a photo, and what stands for it now`;
+      rows.push(element("figure", { class: "preview" }, element("img", { src: p.url, alt: said }), element("figcaption", {}, said)));
+    }
     body.replaceChildren(...rows);
   }
   ask();
