@@ -236,6 +236,7 @@ def test_a_run_at_work(drive, built, asset, tmp_path):
             said, count = drive(server.url, steps)
             assert "cameras from photos" in said and "volume: step 100 of 400" in said and "left in this stage" in said
             assert count == 2
+            assert drive(server.url, [{"wait": "document.getElementById('photo').naturalWidth == 8"}]) == []
             save_asset(tmp_path / "run/asset", asset)
     assert drive(server.url, [READY, {"eval": "relit.manifest.title"}]) == ["mug"]
     server.shutdown()

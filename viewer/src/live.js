@@ -50,6 +50,12 @@ export function showLive(panel, manifest, finished) {
       rows.push(element("figure", { class: "preview" }, element("img", { src: p.url, alt: said }), element("figcaption", {}, said)));
     }
     body.replaceChildren(...rows);
+    if (!had && status.previews.length) { // there is nothing else to look at yet
+      const newest = document.getElementById("photo");
+      newest.src = status.previews[0].url;
+      newest.style.width = "92%";
+      newest.hidden = false;
+    }
   }
   ask();
 }
