@@ -35,12 +35,16 @@ def not_empty(crops: list[Crop]) -> list[np.ndarray]:
     return [np.where(c.weight > 0.5, c.mask, 1.0).astype(np.float32) if is_cut(c) else c.mask for c in crops]
 
 
-def crop_bank(crops: list[Crop], cameras: list[Camera]) -> PixelBank:
-    """The crops' pixels; of cut ones only those that are known are drawn."""
+def crop_bank(crops: list[Crop], cameras: list[Camera], shares=None) -> PixelBank:
+    """The crops' pixels; of cut ones only those that are known are drawn, of all in proportion to shares (P,) in [0, 1], if there are."""
     bank = make_bank(cameras, [c.rgb for c in crops], [c.mask for c in crops])
     known = [(c.weight > 0.5).ravel() if is_cut(c) else np.ones(c.mask.size, bool) for c in crops]
     candidates = np.array(bank.candidates)
-    bank.candidates = mi.UInt32(candidates[np.concatenate(known)[candidates]])
+    candidates = candidates[np.concatenate(known)[candidates]]
+    if shares is not None:
+        view = np.searchsorted(np.array(bank.offsets), candidates, side="right") - 1
+        candidates = candidates[np.random.default_rng(0).random(len(candidates)) < np.asarray(shares)[view]]
+    bank.candidates = mi.UInt32(candidates)
     return bank
 
 

@@ -78,10 +78,22 @@ def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=
 
 
 def find_poses(
-    crops, directions, degrees: float, schedule: Schedule, keep: int, starts: int, without, seed: int, say, cycles: int = 0, linked=None
+    crops,
+    directions,
+    degrees: float,
+    schedule: Schedule,
+    keep: int,
+    starts: int,
+    without,
+    seed: int,
+    say,
+    cycles: int = 0,
+    linked=None,
+    soft=False,
 ):
     """Poses (P, 4, 4) and scores (P,), from hints where half of the photos have them, else by growth. cycles: of `polish` after that.
-    without: names of `collection.WITHOUT`. linked: (poses, scores, held) of `collection_links.poses_from_links`, which then come first."""
+    without: names of `collection.WITHOUT`. linked: (poses, scores, held) of `collection_links.poses_from_links`, which then come first.
+    soft: see `poses_from_hints`."""
     hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
     keep = 1 if "multiplex" in without else keep
     if "search" in without:
@@ -96,7 +108,7 @@ def find_poses(
     if linked is not None:
         poses, scores, held = linked
     elif hinted >= 0.5:
-        poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep)
+        poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep, soft and keep > 1)
     else:
         poses, scores = poses_by_growth(crops, starts, keep, seed, tell)
     return polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held) if cycles > 0 else (poses, scores)

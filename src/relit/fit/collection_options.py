@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from relit.errors import UserError, did_you_mean
 
@@ -12,7 +13,8 @@ WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "l
 @dataclass(frozen=True)
 class CollectionOptions:
     """side: pixels of the photos' longer side. rounds: of coarse fit and registration. polish: turns of descent and search after them.
-    keep: hypotheses of each photo that are refined (SAMURAI's multiplex). hints: whether quadrants or angles are used. holdout: every so
+    keep: hypotheses of each photo that are refined (SAMURAI's multiplex). assignment: 'best': one of them takes part in the coarse fits;
+    'soft': several, by SAMURAI's shares with memory and momentum. hints: whether quadrants or angles are used. holdout: every so
     many photos are set aside (0: none but those of held_out.json). starts: photos that growth begins from without hints. least_score: of
     the registration, on average, and least_agreement: share of photos that find their place in a model of the others, below which the
     poses are taken for wrong. levels, level_steps, rays: of the volume pass.
@@ -25,6 +27,7 @@ class CollectionOptions:
     rounds: int = 6
     polish: int = 3
     keep: int = 3
+    assignment: Literal["best", "soft"] = "best"
     hints: bool = True
     holdout: int = 0
     starts: int = 4

@@ -18,6 +18,7 @@ import numpy as np
 from relit.cameras.se3 import look_at, rotation_angle
 from relit.conventions import similarity
 from relit.fit.collection_framing import crop_bank, is_cut, not_empty
+from relit.fit.collection_multiplex import expanded, updated, with_refined
 from relit.fit.loop import NoStage
 from relit.fit.pixels import corrected
 from relit.fit.register import (
@@ -117,26 +118,32 @@ def hull_by_vote(cameras: list[Camera], masks: list[np.ndarray], nodes: int, tol
     raise ValueError("the silhouettes have nothing in common")
 
 
-def coarse_model(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, tolerance: float, seed: int, limit=None) -> VolumeModel:
-    """Hull by vote and a short volume fit. limit: (n, n, n) bool, where the object may be, or None."""
+def coarse_model(crops: list[Crop], poses, nodes: int, steps: int, tolerance: float, seed: int, limit=None, shares=None) -> VolumeModel:
+    """Hull by vote and a short volume fit. limit: (n, n, n) bool, where the object may be, or None. shares: (P,) how much each crop is
+    looked at, or None for all alike."""
     cameras = crop_views(crops, poses)
     values = hull_by_vote(cameras, not_empty(crops), nodes, tolerance, limit)
     model = start_model(values, np.full(3, GREY), None, full=False)
-    bank = crop_bank(crops, cameras)
+    bank = crop_bank(crops, cameras, shares)
     options = VolumeOptions((nodes,), (steps,), 4096, sdf_rate=0.1, feature_rate=0.03, sharpness=(0.7, 1.5), step=0.8)
     return fit_volume(bank, model, options, NoStage(), seed)
 
 
-def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep: int = 3):
+def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep=3, soft=False):
     """Poses (P, 4, 4) and scores (P,) when each photo's direction is known to within `degrees`. directions: (P, 3) unit, zeros where a
-    photo has none: such photos are registered from the second round on, wherever they fit."""
+    photo has none: such photos are registered from the second round on, wherever they fit. soft: several hypotheses of a photo take part
+    in the fits (see collection_multiplex.py)."""
     rings = crop_rings(crops, PARTS)
     hinted = np.linalg.norm(directions, axis=1) > 0.5
     poses = np.array([pose_towards(c, d if h else [0, 0, 1.0]) for c, d, h in zip(crops, directions, hinted, strict=True)])
     rounds, used, scores = len(schedule.nodes), np.flatnonzero(hinted), np.zeros(len(crops))
+    multiplex = None
     for i in range(rounds):
-        some = [crops[k] for k in used]
-        model = coarse_model(some, gauge(crops, poses)[used], schedule.nodes[i], schedule.steps[i], schedule.tolerance[i], seed + i)
+        some, own, shares = [crops[k] for k in used], gauge(crops, poses)[used], None
+        if multiplex is not None and len(used) == len(crops):
+            some, own, shares = expanded(crops, multiplex)
+            own = gauge(some, own)
+        model = coarse_model(some, own, schedule.nodes[i], schedule.steps[i], schedule.tolerance[i], seed + i, None, shares)
         render = volume_render(model)
         gallery = make_gallery(render, views_from(directions_around(schedule.views[i], seed + i)), PARTS)
         prior = HINT * (1 - i / rounds) * hint_prior(gallery, directions, degrees, 15.0) * hinted[:, None, None]
@@ -146,6 +153,8 @@ def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, 
         if i > 0:
             last = i == rounds - 1
             poses, scores = best_refined(crops, found, render, rings, keep if last else 1, REFINE if last else COARSE)
+        if soft:
+            multiplex = with_refined(updated(multiplex, found, i / max(rounds - 1, 1)), poses)
         used = np.arange(len(crops)) if len(used) == len(crops) else np.flatnonzero(hinted | (scores > np.median(scores[hinted])))
         say(f"round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
     return gauge(crops, poses), scores

@@ -23,6 +23,7 @@ from relit.lighting.per_photo import TEXELS, LightComponents, PhotoLights, light
 from relit.materials.field import MaterialField, material_at, project, slope_at
 from relit.rendering.transport import TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 
+LEAST = 0.02  # weight of a silenced photo: the material hardly hears it, its own light still follows
 HISTORY = 1000  # losses in the ring buffer of posterior scaling
 
 
@@ -141,7 +142,8 @@ def fit_collection_surface(
         slope = slope_at(material, points.uv, valid)
         points.n = bent_normal(points, slope)
         a, b = reflected(points, drawn, surface, of)
-        weight = dr.gather(mi.Float, mi.Float(model.weights), batch.view)
+        heard = np.maximum(model.weights, LEAST).astype(np.float32)
+        weight = dr.gather(mi.Float, mi.Float(heard), batch.view)
         each = residuals(a, b, batch.rgb)
         fit = weighted_mean(each, dr.select(valid, weight, 0))
         loss = fit
@@ -161,7 +163,7 @@ def fit_collection_surface(
             material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
             project(material)
             dr.eval(material.colour, material.metallic, material.slope)
-        g = np.array(gradients[0]).reshape(views, TEXELS * 3)
+        g = np.array(gradients[0]).reshape(views, TEXELS * 3) / heard[:, None]  # the scaling is the material's, not the lights'
         gc = model.family.pull_back(model.coefficients, g) + light.prior / views * model.coefficients
         gg = g.reshape(views, TEXELS, 3).sum(1)
         if not frozen:

@@ -1,0 +1,69 @@
+"""SAMURAI's soft assignment: shares, their memory, and what takes part in a fit."""
+
+import numpy as np
+
+from relit.cameras.se3 import exp_so3
+from relit.conventions import similarity
+from relit.fit.collection_multiplex import Multiplex, expanded, shares_of, updated, with_refined
+from relit.fit.register import Hypotheses
+
+
+def turned(*degrees):
+    """Poses turned about y by so many degrees."""
+    return np.array([similarity(exp_so3(np.array([0, np.radians(a), 0])), np.zeros(3)) for a in degrees])
+
+
+def found(angles, scores):
+    return Hypotheses(turned(*angles)[None], np.array([scores], float), np.zeros((1, len(angles)), int))
+
+
+def test_shares_follow_scores_and_sharpen():
+    scores = np.array([[0.95, 0.90, -1.0]])
+    early, late = shares_of(scores, 1.0), shares_of(scores, 10.0)
+    assert np.allclose(early, [[1 / (1 + np.exp(-1)), 1 / (1 + np.exp(1)), 0]])
+    assert late[0, 0] > 0.999 and late[0, 2] == 0
+
+
+def test_memory_outlives_one_bad_round():
+    state = updated(None, found([0, 90], [0.95, 0.85]), 0.5)
+    held = state.memory[0, 0]
+    state = updated(state, found([92, 1], [0.93, 0.92]), 0.5)  # in another order, and the other one scores a little better
+    assert state.memory[0, 1] > 0.6 and state.memory[0, 1] < held
+    assert np.allclose(state.best, turned(1))
+    for _ in range(8):
+        state = updated(state, found([90, 0], [0.95, 0.85]), 0.5)
+    assert state.memory[0, 0] > 0.9  # what goes on being better wins
+
+
+def test_a_new_hypothesis_starts_with_its_share():
+    state = updated(None, found([0, 90], [0.95, 0.94]), 0.0)
+    state = updated(state, found([180, 0], [0.99, 0.80]), 0.0)
+    assert np.allclose(state.memory.sum(1), 1) and state.memory[0, 0] > 0.3
+
+
+def test_what_takes_part():
+    memory = np.array([[0.6, 0.4, 0.0], [0.95, 0.04, 0.01]])
+    state = Multiplex(np.stack([turned(0, 90, 180), turned(10, 100, 190)]), memory, np.zeros((2, 3)))
+    crops, poses, shares = expanded(["a", "b"], state)
+    assert crops == ["a", "a", "b"] and np.allclose(shares, [0.6, 0.4, 0.95]) and np.allclose(poses, turned(0, 90, 10))
+    refined = with_refined(state, np.stack([turned(84)[0], turned(12)[0]]))
+    assert np.allclose(refined.poses[0], turned(0, 84, 180)) and np.allclose(refined.poses[1], turned(12, 100, 190))
+
+
+def test_rounds_with_soft_assignment_find_the_poses():
+    import pytest
+
+    pytest.importorskip("mitsuba")
+    from volume_lump import photos_of, volume_lump
+
+    from relit.cameras.se3 import camera_errors
+    from relit.fit.collection_poses import even_colours, poses_from_hints, schedule_of
+    from relit.fit.register import crop_photo
+
+    photos = photos_of(volume_lump(), 10, np.random.default_rng(4))
+    crops = even_colours([crop_photo(*p) for p in photos])
+    truth = np.array([c.world_from_camera for *_, c in photos])
+    off = exp_so3(np.radians([0, 20.0, 0]))
+    hints = np.array([(off if i % 2 else off.T) @ (c[:3, 3] / np.linalg.norm(c[:3, 3])) for i, c in enumerate(truth)])
+    poses, _ = poses_from_hints(crops, hints, 45.0, schedule_of(3), 0, lambda *_: None, 2, soft=True)
+    assert np.median(camera_errors(poses, truth)[0]) < 8
