@@ -48,22 +48,3 @@ def test_what_takes_part():
     assert crops == ["a", "a", "b"] and np.allclose(shares, [0.6, 0.4, 0.95]) and np.allclose(poses, turned(0, 90, 10))
     refined = with_refined(state, np.stack([turned(84)[0], turned(12)[0]]))
     assert np.allclose(refined.poses[0], turned(0, 84, 180)) and np.allclose(refined.poses[1], turned(12, 100, 190))
-
-
-def test_rounds_with_soft_assignment_find_the_poses():
-    import pytest
-
-    pytest.importorskip("mitsuba")
-    from volume_lump import photos_of, volume_lump
-
-    from relit.cameras.se3 import camera_errors
-    from relit.fit.collection_poses import even_colours, poses_from_hints, schedule_of
-    from relit.fit.register import crop_photo
-
-    photos = photos_of(volume_lump(), 10, np.random.default_rng(4))
-    crops = even_colours([crop_photo(*p) for p in photos])
-    truth = np.array([c.world_from_camera for *_, c in photos])
-    off = exp_so3(np.radians([0, 20.0, 0]))
-    hints = np.array([(off if i % 2 else off.T) @ (c[:3, 3] / np.linalg.norm(c[:3, 3])) for i, c in enumerate(truth)])
-    poses, _ = poses_from_hints(crops, hints, 45.0, schedule_of(3), 0, lambda *_: None, 2, soft=True)
-    assert np.median(camera_errors(poses, truth)[0]) < 8
