@@ -1,7 +1,7 @@
 """Photos in a dark room under the camera's own flash -> shape, rough plastic and the flash itself. The recipe of the `flash` capture.
 
     photos     decode, carry the cameras to the unit frame
-    hull       visual hull of the masks
+    hull       visual hull of the masks, opened where the photos contradict it     fit/hollows.py
     volume     signed distance field by volume rendering, shaded by the flash at each rendered point     rendering/shade_flash.py
     mesh       zero level set, decimated; texture atlas; albedos of each vertex
     surface    rough-plastic textures, normal map and flash by exact direct light and estimated inter-reflection   fit/flash_surface.py
@@ -23,6 +23,7 @@ from relit.errors import UserError, did_you_mean
 from relit.fit.flash_dino import DinoNetwork, network_file
 from relit.fit.flash_features import FlashView, capture_features, network_features
 from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
+from relit.fit.hollows import HollowOptions, open_hollows, without
 from relit.fit.kinship import start_kinship
 from relit.fit.multiview import load_pixels, rotation_from_y, run_arrays, score_held_out
 from relit.fit.pixels import PixelBank
@@ -51,6 +52,7 @@ class FlashOptions:
     """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. max_pixels: photos are
     shrunk until all together have no more. shadows: soft visibility in the last level of the volume pass.
     faces: of the mesh, about. texture: texels a side. surface_steps, points: steps of the surface pass, pixels per step.
+    hollows: nodes a side of the search for concavities that no silhouette shows (fit/hollows.py), 0 for none.
     directions: of inter-reflection per pixel and estimate. bounces: of it. ior: index of refraction of the coat.
     smooth: weight of the material's smoothness. patches: weight of PIR's pyramid and SSIM terms, none by default.
     dino: an ONNX file of a DINO network whose features tell which places are alike, or `hub:OWNER/NAME/PATH` to fetch it; what the
@@ -62,6 +64,7 @@ class FlashOptions:
     rays: int = 8192
     max_pixels: int = 24_000_000
     shadows: bool = True
+    hollows: int = 64
     faces: int = 60_000
     texture: int = 512
     surface_steps: int = 2000
@@ -88,6 +91,7 @@ PRESETS = {
     "draft": {
         "levels": (48, 96),
         "level_steps": (150, 200),
+        "hollows": 48,
         "rays": 4096,
         "max_pixels": 8_000_000,
         "faces": 20_000,
@@ -188,7 +192,6 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
     distance2 = float(np.median([c.centre @ c.centre for c in cameras]))
     intensity = np.pi * distance2 * float(level.mean()) / (START_ALBEDO * MEAN_COSINE)
     shadows = options.shadows and "shadow" not in options.without
-    appearance = FlashAppearance(coat, intensity, options.levels[-1] if shadows else np.inf)
     with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
         try:
             values = visual_hull(cameras, masks, options.levels[0])
@@ -199,14 +202,24 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
                 "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS",
                 code=4,
             ) from None
-        model = start_model(values, START_ALBEDO * level / level.mean(), None, full=False)
-        model.reflections, model.rates = start_learnt()
-        if "offset" in options.without:
-            rates = np.array(model.rates)
-            rates[:3] = 0
-            model.rates = mi.Float(rates)
-        model.appearance, appearance.model = appearance, model
-        model.extra["intensity"] = intensity
+
+        def start(values: np.ndarray, full: bool) -> VolumeModel:
+            model = start_model(values, START_ALBEDO * level / level.mean(), None, full=full)
+            model.reflections, model.rates = start_learnt()
+            if "offset" in options.without:
+                rates = np.array(model.rates)
+                rates[:3] = 0
+                model.rates = mi.Float(rates)
+            appearance = FlashAppearance(coat, intensity, options.levels[-1] if shadows else np.inf)
+            model.appearance, appearance.model = appearance, model
+            model.extra["intensity"] = intensity
+            return model
+
+        if options.hollows > 0 and not stage.load("checkpoint"):
+            o = HollowOptions(options.hollows)
+            coarse = visual_hull(cameras, masks, o.nodes)
+            values = without(values, open_hollows(bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed))
+        model = start(values, False)
         fit_volume(bank, model, VolumeOptions(options.levels, options.level_steps, options.rays), stage, seed)
         offset = np.array(model.reflections)[:3]
         run.say(f"flash after the volume pass: offset {offset.round(4).tolist()} of the object sphere's radius")

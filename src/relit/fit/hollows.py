@@ -1,0 +1,188 @@
+"""Concavities that silhouettes cannot show: a first shape that is opened where the photos contradict the visual hull.
+
+The hull of a cup has a lid. The volume pass does not leave it: a small dent in a lid explains the photos no better than none, because the
+near wall of the dent hides what its far wall gains. So a larger step is tried. The hull is fitted for a while on a coarse grid;
+where the surface is then explained badly it counts as open, and all that lies under it, but for a wall along the surface that is
+explained well, is taken away. Fitted for as long from the same start, the opened shape is kept if it explains the photos clearly
+better; then it is opened further in the same manner. A convex object costs one fit and one trial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import binary_dilation, binary_propagation, distance_transform_edt, gaussian_filter
+
+from relit.fit.losses import display_weight
+from relit.fit.pixels import PixelBank, batch_of
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.geometry.hull import distance_of
+from relit.geometry.sdf import dense_values, node_positions, resample
+from relit.rendering.march import march, sphere_interval
+from relit.scene import Camera
+
+
+@dataclass(frozen=True)
+class HollowOptions:
+    """nodes a side, steps and rays of each trial. sharpness: as in VolumeOptions.
+
+    well: quantile of the surface's error that is good; bad: times that, from which on it counts as open. wall: thickness in voxels that
+    is left. gain: part of the error that a trial must take away. rounds: of trials. least: nodes that are worth a trial. probes: rays
+    that the error is taken from. blur: of its map, voxels.
+    """
+
+    nodes: int = 48
+    steps: int = 150
+    rays: int = 4096
+    well: float = 0.25
+    bad: float = 2.5
+    wall: float = 2.0
+    gain: float = 0.05
+    rounds: int = 3
+    sharpness: tuple[float, float] = (1.0, 4.0)
+    least: int = 20
+    probes: int = 200_000
+    blur: float = 1.5
+
+
+class _NoStage:
+    """Trials keep nothing and report nothing."""
+
+    def load(self, name):
+        return None
+
+    def save(self, name, **arrays):
+        pass
+
+    def step(self, i, **losses):
+        pass
+
+    def preview_due(self):
+        return False
+
+    def preview(self, render):
+        pass
+
+    def checkpoint_due(self):
+        return False
+
+
+def open_hollows(
+    bank: PixelBank,
+    cameras: list[Camera],
+    values: np.ndarray,
+    start: Callable[[np.ndarray], VolumeModel],
+    options: HollowOptions,
+    say: Callable[[str], None],
+    seed: int = 0,
+) -> np.ndarray | None:
+    """What is to be taken away from a visual hull: (n, n, n) distances, negative in the hollows, or None where there are none.
+
+    values: (n, n, n) distances of the hull, n = options.nodes. cameras: unit frame. start: distances -> a fresh model of the capture kind.
+    """
+    o, hull = options, values < 0
+    some = cameras[:: max(1, len(cameras) // 40)]
+
+    def fitted(v: np.ndarray):
+        model = start(v)
+        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), _NoStage(), seed)
+        return dense_values(model.grid), *surface_error(bank, model, o, seed)
+
+    shape, error, where = fitted(values)
+    for _ in range(o.rounds):
+        trial = opened(shape, where, some, o)
+        if trial is None:
+            break
+        new = fitted(trial)
+        say(f"a hollow was tried: mean squared error {error:.5f} without, {new[1]:.5f} with it")
+        if new[1] > (1 - o.gain) * error:
+            break
+        values, (shape, error, where) = trial, new
+    gone = hull & (values >= 0)
+    return distance_of(gone) if gone.any() else None
+
+
+def without(values: np.ndarray, hollows: np.ndarray | None) -> np.ndarray:
+    """Distances (n, n, n) of a shape without its hollows, which may have another number of nodes."""
+    return values if hollows is None else np.maximum(values, -resample(hollows, values.shape[0]))
+
+
+def surface_error(bank: PixelBank, model: VolumeModel, o: HollowOptions, seed: int):
+    """(mean error, (n, n, n) mean error of the rays whose surface point is near each node, NaN where there are none): squared differences
+    of display values over whole object pixels."""
+    n = o.nodes
+    rng = mi.PCG32(size=o.probes, initstate=seed + 77)
+    with dr.suspend_grad():
+        k = dr.minimum(mi.UInt32(rng.next_float32() * dr.width(bank.candidates)), dr.width(bank.candidates) - 1)
+        batch = batch_of(bank, dr.gather(mi.UInt32, bank.candidates, k))
+        t0, t1 = sphere_interval(batch.o, batch.d)
+        dr.eval(batch.o, batch.d, batch.rgb, batch.mask, batch.view, t0, t1)
+        m = march(model.grid, batch.o, batch.d, t0, t1, dr.opaque(mi.Float, model.inv_s), dr.opaque(mi.Float, model.grid.h))
+        colour, _ = model.shade(m, batch, bank.cameras)
+        r = dr.square(colour - batch.rgb) * display_weight(batch.rgb)
+        value = (r.x + r.y + r.z) / 3
+        ok = (m.opacity > 0.5) & (batch.mask > 0.99) & dr.isfinite(value)
+        x = batch.o + batch.d * (m.depth / dr.maximum(m.opacity, 0.05))
+        value, ok, x = np.array(value), np.array(ok), np.array(x).T
+    node = np.clip(np.round((x[ok] * 0.5 + 0.5) * (n - 1)).astype(int), 0, n - 1)
+    flat = (node[:, 2] * n + node[:, 1]) * n + node[:, 0]
+    value = np.minimum(value[ok], 4 * value[ok].mean())  # highlights
+    total, count = (np.bincount(flat, w, n**3).reshape(n, n, n) for w in (value, np.ones_like(value)))
+    total, count = gaussian_filter(total, o.blur), gaussian_filter(count, o.blur)
+    return float(value.mean()), np.where(count > 0.02, total / np.maximum(count, 1e-9), np.nan)
+
+
+def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: HollowOptions) -> np.ndarray | None:
+    """Distances of the shape without what lies under its badly explained surface; None where that is nothing, or nearly all."""
+    inside = shape < 0
+    skin = inside & (distance_transform_edt(inside) < 1.5) & np.isfinite(where)
+    if not skin.any():
+        return None
+    bad = skin & (where > o.bad * np.quantile(where[skin], o.well))
+    good = skin & ~bad
+    if bad.sum() < o.least or not good.any():
+        return None
+    far = inside & (distance_transform_edt(~good) > o.wall)
+    gone = binary_propagation(bad & far, mask=far)
+    gone &= ~binary_dilation(bare(cameras, inside & ~gone, gone), iterations=2)  # a handle keeps its root
+    left = inside & ~gone
+    if gone.sum() < o.least or not left.any():
+        return None
+    return distance_of(left)
+
+
+def bare(cameras: list[Camera], left: np.ndarray, gone: np.ndarray) -> np.ndarray:
+    """Which nodes of `gone` some camera sees with nothing of `left` behind or before them: without them the silhouette would have a hole.
+    left, gone: (n, n, n) bool."""
+    n = left.shape[0]
+    p = node_positions(n)
+    solid, asked = p[left].astype(np.float64), p[gone].astype(np.float64)
+    out = np.zeros(len(asked), bool)
+    for camera in cameras:
+        scale = np.linalg.norm(camera.centre) * 0.5 * (n - 1) / camera.fx  # a voxel at the centre is a pixel of the small picture
+        w, h = (max(2, round(side * scale)) for side in (camera.width, camera.height))
+        columns, rows, _ = small_pixels(camera, solid, w, h)
+        cover = np.zeros((h, w), bool)
+        cover[rows, columns] = True
+        cover = binary_dilation(cover, np.ones((3, 3), bool))
+        columns, rows, seen = small_pixels(camera, asked, w, h)
+        out[seen] |= ~cover[rows, columns]
+    found = np.zeros_like(gone)
+    found[gone] = out
+    return found
+
+
+def small_pixels(camera: Camera, points: np.ndarray, width: int, height: int):
+    """Columns and rows of those points (N, 3), unit frame, that lie in the picture of `camera` shrunk to (width, height); and which they
+    are (N,) bool."""
+    m = camera.camera_from_world
+    q = points @ m[:3, :3].T + m[:3, 3]
+    z = np.maximum(q[:, 2], 1e-6)
+    column = np.floor((camera.fx * q[:, 0] / z + camera.cx) * (width / camera.width)).astype(np.int64)
+    row = np.floor((camera.fy * q[:, 1] / z + camera.cy) * (height / camera.height)).astype(np.int64)
+    seen = (q[:, 2] > 1e-6) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    return column[seen], row[seen], seen
