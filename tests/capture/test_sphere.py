@@ -63,6 +63,16 @@ def test_masks_of_different_places():
         s.sphere_from_masks([replace_mask(v, i) for i, v in enumerate(good)])
 
 
+def test_the_masks_that_miss_the_object_are_named():
+    good = views(shots.ring(10))
+    wrong = np.zeros_like(good[3].mask)
+    wrong[:6, :6] = 1
+    named = [s.View(v.camera, mask=wrong if i in (3, 7) else v.mask, name=f"p{i}.png") for i, v in enumerate(good)]
+    with pytest.raises(UserError, match="no place in common") as caught:
+        s.sphere_from_masks(named)
+    assert caught.value.why.endswith(": p3.png, p7.png") and "--edit" in caught.value.fix
+
+
 def replace_mask(view, i):
     mask = np.zeros_like(view.mask)
     mask[(4, 48)[i % 2] :, :][:6, 4 + 11 * i : 10 + 11 * i] = 1

@@ -81,7 +81,9 @@ def open_capture(
     corrected = set() if masks == "none" else set(corrected_masks(reading.root))
     empty = {i for i, m in enumerate(small) if m is not None and not (m > 0.5).any() and not reading.frames[i].held_out}
     dropped = {i for i in empty if photos[i].name not in corrected}
-    views = [View(f.camera, f.lens or lens_of(f.camera), m) if f.camera else None for f, m in zip(reading.frames, small, strict=True)]
+    views = [
+        View(f.camera, f.lens or lens_of(f.camera), m, f.name) if f.camera else None for f, m in zip(reading.frames, small, strict=True)
+    ]
     photos = [with_calibration(p, f) for p, f in zip(photos, reading.frames, strict=True)]
     if corrected:
         photos = with_corrected_masks(photos, reading.root, masks == "grabcut" or any(m is not None for m in small), notes)

@@ -18,11 +18,12 @@ MOST_VIEWS = 40  # of the masks of a large capture, so many are carved with
 
 @dataclass(frozen=True)
 class View:
-    """What the sphere is found from: a camera as calibrated, its lens, and a small mask (h, w) of the same shape, or None."""
+    """What the sphere is found from: a camera as calibrated, its lens, a small mask (h, w) of the same shape or None, the photo's name."""
 
     camera: Camera
     lens: Lens | None = None
     mask: np.ndarray | None = None
+    name: str = ""
 
 
 def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sphere, str]:
@@ -132,21 +133,35 @@ def sphere_from_masks(views: list[View]) -> Sphere:
     distance = np.linalg.norm(origins - centre, axis=1)
     radius = float(np.quantile(distance * np.tan(np.array(spread)), 0.9))
     grown = [cv2.dilate((v.mask > 0.5).astype(np.uint8), np.ones((3, 3), np.uint8)) for v in views]
-    kept = np.empty((0, 3))
-    low, high = centre - 1.6 * radius, centre + 1.6 * radius
+    kept, low, high = np.empty((0, 3)), centre - 1.6 * radius, centre + 1.6 * radius
+    start = (low, high)
     for _ in range(3):  # each pass carves the box of what the last one left
         kept, cell = _carve(views, grown, low, high)
         if len(kept) == 0:
-            break
+            raise _disagreement(views, grown, *start)
         low, high = kept.min(0) - 1.5 * cell, kept.max(0) + 1.5 * cell
-    if len(kept) == 0:
-        raise UserError(
-            "the masks of different photos have no place in common",
-            "masks and cameras do not belong together, the poses use other axes than the format says, or the masks show different things",
-            "check one pose and one mask by hand, or give the object sphere (--sphere X,Y,Z,RADIUS)",
-        )
     centre, reach = smallest_ball(kept)
     return Sphere(centre, (reach + 0.5 * float(np.linalg.norm(cell))) / FILL)
+
+
+def _disagreement(views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np.ndarray) -> UserError:
+    """Names the masks that miss what the others show, where a third of them or fewer does."""
+    what = "the masks of different photos have no place in common"
+    kept, _ = _carve(views, masks, low, high, spare=1 / 3)
+    misses = []
+    for view, mask in zip(views, masks, strict=True):
+        inside, column, row = _shown(view, mask.shape, kept)
+        if inside.any() and mask[row[inside], column[inside]].mean() < 0.5:
+            misses.append(view.name)
+    if len(kept) and misses and all(misses) and len(misses) <= len(views) / 3:
+        named = ", ".join(misses[:6]) + (", ..." if len(misses) > 6 else "")
+        why = f"most of them share a place, but these masks do not hold it: {named}"
+        return UserError(what, why, "correct those masks (relit inspect INPUT --edit) or leave those photos out, or use --masks none")
+    return UserError(
+        what,
+        "masks and cameras do not belong together, the poses use other axes than the format says, or the masks show different things",
+        "check one pose and one mask by hand, or give the object sphere (--sphere X,Y,Z,RADIUS)",
+    )
 
 
 def _mask_cone(view: View) -> tuple[np.ndarray, float]:
@@ -162,28 +177,37 @@ def _mask_cone(view: View) -> tuple[np.ndarray, float]:
     return c.world_from_camera[:3, :3] @ middle, min(angle, 1.2)
 
 
-def _carve(views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """-> (centres (K, 3) of the cells that stay, size (3,) of a cell). A cell must be shown by half of the views, and two at least."""
+def _shown(view: View, shape: tuple[int, int], points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points (K, 3): whether they fall into the picture (K,), and the column and row of its (h, w) copy that they fall on."""
+    h, w = shape
+    c = view.camera.resized(w, h)
+    m = c.camera_from_world
+    q = points @ m[:3, :3].T + m[:3, 3]
+    front = q[:, 2] > 1e-9
+    xy = q[:, :2] / np.where(front, q[:, 2], 1.0)[:, None]
+    front &= (np.abs(xy) < 4).all(axis=1)  # polynomial lenses fold back far off the axis
+    pixel = np.floor(pixels_from_ideal(c, view.lens, np.where(front[:, None], xy, 0.0))).astype(int)
+    inside = front & (pixel >= 0).all(axis=1) & (pixel[:, 0] < w) & (pixel[:, 1] < h)
+    return inside, pixel[:, 0], pixel[:, 1]
+
+
+def _carve(views: list[View], masks: list[np.ndarray], low, high, spare: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+    """-> (centres (K, 3) of the cells that stay, size (3,) of a cell). A cell must be shown by half of the views, and two at least.
+
+    spare: of 20 views or more, so large a share may have a hole in their mask.
+    """
     cell = (high - low) / GRID
     axes = [low[i] + (np.arange(GRID) + 0.5) * cell[i] for i in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     shown, hit = np.zeros(len(points), int), np.zeros(len(points), int)
-    spare = 0.05 * len(views) if len(views) >= 20 else 0  # of many views, a few may have a hole in their mask
+    several = spare * len(views) if len(views) >= 20 or spare > 0.05 else 0
     for view, mask in zip(views, masks, strict=True):
-        h, w = mask.shape
-        c = view.camera.resized(w, h)
-        m = c.camera_from_world
-        q = points @ m[:3, :3].T + m[:3, 3]
-        front = q[:, 2] > 1e-9
-        xy = q[:, :2] / np.where(front, q[:, 2], 1.0)[:, None]
-        front &= (np.abs(xy) < 4).all(axis=1)  # polynomial lenses fold back far off the axis
-        pixel = np.floor(pixels_from_ideal(c, view.lens, np.where(front[:, None], xy, 0.0))).astype(int)
-        inside = front & (pixel >= 0).all(axis=1) & (pixel[:, 0] < w) & (pixel[:, 1] < h)
+        inside, column, row = _shown(view, mask.shape, points)
         # a mask that keeps off the picture's border shows the whole object: there is none of it outside the picture
         whole = not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
         shown += inside | whole
-        hit[inside] += mask[pixel[inside, 1], pixel[inside, 0]]
-        alive = shown - hit <= spare
+        hit[inside] += mask[row[inside], column[inside]]
+        alive = shown - hit <= several
         points, shown, hit = points[alive], shown[alive], hit[alive]
     return points[shown >= max(2, len(views) / 2)], cell
 
