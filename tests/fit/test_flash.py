@@ -33,6 +33,8 @@ def test_a_flash_that_did_not_fire(device):
     with pytest.raises(UserError, match="black") as error:
         flash.check_photos(bank, views, masks, np.full(3, 0.001))
     assert "did not fire" in error.value.why
+    with pytest.raises(UserError, match="photos are black"):  # no backdrop is found in them either: that is not their fault
+        flash.check_photos(bank, views, None, np.full(3, 0.001))
 
 
 def test_over_exposed_photos(device):

@@ -158,6 +158,10 @@ def saturation(capture: Capture) -> float:
 
 def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarray) -> None:
     """Raises UserError for photos that are no flash capture that could be reconstructed. level: mean radiance of the object (3,)."""
+    if float(np.max(level)) < 0.004:
+        raise UserError(
+            "the photos are black", "the flash did not fire, or the exposure was far too short", "look at the photos, and take them again"
+        )
     if masks is None:
         raise UserError(
             "the surroundings are not dark, and there are no masks",
@@ -174,10 +178,6 @@ def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarra
         )
     rgbm = np.array(bank.rgbm).reshape(-1, 4)
     inside = rgbm[rgbm[:, 3] > 0.99][::7, :3]
-    if float(np.max(level)) < 0.004:
-        raise UserError(
-            "the photos are black", "the flash did not fire, or the exposure was far too short", "look at the photos, and take them again"
-        )
     burnt = float((inside.min(1) >= 0.99).mean()) if len(inside) else 0.0
     if burnt > 0.5:
         raise UserError(
