@@ -253,3 +253,43 @@ def test_unknown_ablation(tmp_path):
     with pytest.raises(UserError) as raised:
         reconstruct(photos(tmp_path / "in", blob), tmp_path / "run", "without=multiplexx")
     assert raised.value.code == 2
+
+
+def test_the_surface_pass_takes_the_network_and_the_first_colours(tmp_path):
+    """Under Neural-PIL's lights the codes move; L_init holds the base colour where it began."""
+    import sys
+    from pathlib import Path
+
+    from relit.device import use_device
+
+    use_device("cpu")
+    sys.path.insert(0, str(Path(__file__).parents[1] / "lighting"))
+    from lump import lump
+    from test_neural_pil import write_network
+
+    from relit.cameras.se3 import look_at
+    from relit.fit.collection_surface import LightOptions, fit_collection_surface, start_collection_surface
+    from relit.fit.loop import NoStage
+    from relit.fit.pixels import make_bank
+    from relit.fit.surface import ALBEDO_START, SurfaceOptions
+    from relit.lighting.neural_pil import load_neural_pil
+    from relit.materials.field import start_material
+    from relit.rendering.transport import TraceableMesh
+    from relit.scene import Camera
+
+    write_network(tmp_path)
+    network = load_neural_pil(tmp_path)
+    mesh, _ = lump()
+    cameras = [Camera(24, 24, 26, 26, 12, 12, look_at(np.array(eye))) for eye in ((0, 0.5, 3.0), (3.0, 0.5, 0))]
+    rgb = np.full((24, 24, 3), (0.5, 0.2, 0.1), np.float32)
+    bank = make_bank(cameras, [rgb, rgb], [np.ones((24, 24), np.float32)] * 2)
+    moved = []
+    for anchor in (0.0, 300.0):
+        material = start_material(16, np.full((16, 16, 3), 0.3, np.float32), 0.5, 0.05)
+        model = start_collection_surface(material, np.full((2, 3), 0.3), ALBEDO_START, network)
+        options = SurfaceOptions(6, 96, 8, 16)
+        light = LightOptions(anchor=anchor, lambda_a=100.0)
+        fit_collection_surface(bank, TraceableMesh(mesh, np.full((len(mesh.vertices), 3), 0.4)), model, options, light, NoStage(), 0)
+        assert model.coefficients.shape == (2, network.size) and np.abs(model.coefficients).max() > 1e-3
+        moved.append(np.abs(np.array(material.colour).reshape(-1, 4)[:, :3] - 0.3).mean())
+    assert moved[1] < 0.8 * moved[0]

@@ -96,7 +96,7 @@ def find_all(shots: list[Shot], groups: list[Group], degrees: float, run, option
     try:
         begun = None if "search" in without else poses_from_links(crops, groups, shots, hints, degrees, options.keep, seed, run.say)
         args = (crops, hints, degrees, schedule, options.keep, options.starts, without, seed, run.say, options.polish, begun)
-        poses, scores = find_poses(*args, soft=options.assignment == "soft")
+        poses, scores = find_poses(*args, soft=options.lambda_c if options.assignment == "soft" else None)
     except ValueError as error:
         why = f"{error}: the masks belong to different objects, or are wrong"
         raise UserError("no shape agrees with the photos", why, "look at the masks (relit inspect)", code=4) from None

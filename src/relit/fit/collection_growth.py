@@ -108,7 +108,7 @@ def find_poses(
     if linked is not None:
         poses, scores, held = linked
     elif hinted >= 0.5:
-        poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep, soft and keep > 1)
+        poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep, soft if keep > 1 else None)
     else:
         poses, scores = poses_by_growth(crops, starts, keep, seed, tell)
     return polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held) if cycles > 0 else (poses, scores)

@@ -15,7 +15,7 @@ from relit.cameras.se3 import rotation_angle
 from relit.fit.register import Crop, Hypotheses
 
 MOMENTUM, RATE = 0.75, 0.3  # of the memory
-SHARPEST = 10.0  # λ_s in the last round, 1 in the first
+SHARPNESS = (1.0, 10.0)  # λ_s in the first and in the last round
 SCALE = 0.05  # of scores: registration scores of right and wrong poses differ by so much where the paper's losses differ by 1
 SAME = 25.0  # degrees
 HEARD = 0.15  # share from which on a hypothesis takes part
@@ -43,9 +43,10 @@ def shares_of(scores: np.ndarray, sharpness: float) -> np.ndarray:
     return s / np.maximum(s.sum(1, keepdims=True), 1e-12)
 
 
-def updated(before: Multiplex | None, found: Hypotheses, progress: float) -> Multiplex:
+def updated(before: Multiplex | None, found: Hypotheses, progress: float, sharpness=SHARPNESS) -> Multiplex:
     """The multiplex after a search. progress: 0 in the first round, 1 in the last."""
-    shares = shares_of(found.scores, 1 + (SHARPEST - 1) * progress)
+    first, last = sharpness
+    shares = shares_of(found.scores, first + (last - first) * progress)
     if before is None:
         return Multiplex(found.poses, shares, np.zeros_like(shares))
     memory, velocity = np.empty_like(shares), np.zeros_like(shares)

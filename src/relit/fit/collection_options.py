@@ -20,7 +20,9 @@ class CollectionOptions:
     poses are taken for wrong. levels, level_steps, rays: of the volume pass.
     refine_cameras: step of the camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass.
     frozen_steps: of the fit of held-out photos. light_network: folder of Neural-PIL's network, which then takes the place of the shipped
-    prior of lights. without: what an ablation switches off.
+    prior of lights. init_colour: weight of SAMURAI's L_init in the surface pass, a tenth of it after the share lambda_a of its steps (80k
+    of 300k in the paper). lambda_c: sharpness of the soft assignment in the first and the last round. without: what an ablation switches
+    off.
     """
 
     side: int = 400
@@ -44,6 +46,9 @@ class CollectionOptions:
     directions: int = 32
     frozen_steps: int = 150
     light_network: str = ""
+    init_colour: float = 0.0
+    lambda_a: float = 0.27
+    lambda_c: tuple[float, float] = (1.0, 10.0)
     without: tuple[str, ...] = ()
 
     @property
@@ -52,6 +57,8 @@ class CollectionOptions:
         return 150 * self.side**2
 
     def __post_init__(self):
+        if self.lambda_a <= 0 or min(self.lambda_c) <= 0:
+            raise ValueError("lambda_a and lambda_c must be positive")
         for name in self.without:
             if name not in WITHOUT:
                 raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")

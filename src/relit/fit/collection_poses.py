@@ -129,10 +129,10 @@ def coarse_model(crops: list[Crop], poses, nodes: int, steps: int, tolerance: fl
     return fit_volume(bank, model, options, NoStage(), seed)
 
 
-def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep=3, soft=False):
+def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep=3, soft=None):
     """Poses (P, 4, 4) and scores (P,) when each photo's direction is known to within `degrees`. directions: (P, 3) unit, zeros where a
-    photo has none: such photos are registered from the second round on, wherever they fit. soft: several hypotheses of a photo take part
-    in the fits (see collection_multiplex.py)."""
+    photo has none: such photos are registered from the second round on, wherever they fit. soft: sharpness of a soft assignment, or
+    None: then only the best hypothesis of a photo takes part in the fits (see collection_multiplex.py)."""
     rings = crop_rings(crops, PARTS)
     hinted = np.linalg.norm(directions, axis=1) > 0.5
     poses = np.array([pose_towards(c, d if h else [0, 0, 1.0]) for c, d, h in zip(crops, directions, hinted, strict=True)])
@@ -154,7 +154,7 @@ def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, 
             last = i == rounds - 1
             poses, scores = best_refined(crops, found, render, rings, keep if last else 1, REFINE if last else COARSE)
         if soft:
-            multiplex = with_refined(updated(multiplex, found, i / max(rounds - 1, 1)), poses)
+            multiplex = with_refined(updated(multiplex, found, i / max(rounds - 1, 1), soft), poses)
         used = np.arange(len(crops)) if len(used) == len(crops) else np.flatnonzero(hinted | (scores > np.median(scores[hinted])))
         say(f"round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
     return gauge(crops, poses), scores
