@@ -6,7 +6,7 @@ are few numbers each under a learnt prior (lighting/per_photo.py). A photo that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +31,7 @@ HISTORY = 1000  # losses in the ring buffer of posterior scaling
 class LightOptions:
     """rate: step of the lights' numbers. prior: weight of |c|^2 / 2 per photo. neutral: of the mean chroma of all gains: without it, base
     colour and lights drift apart in blue and orange. posterior: whether photos are scaled. anchor: weight of SAMURAI's L_init, the squared
-    difference to the first base colour; it falls to a tenth within the share lambda_a of the steps, and so on."""
+    difference of base colour and the photos' own pixels at even exposure; it falls to a tenth within the share lambda_a of the steps."""
 
     rate: float = 0.03
     prior: float = 1e-3
@@ -111,9 +111,7 @@ def fit_collection_surface(
     even = mean_level(model.family)
     level = mi.Float((np.exp(model.gains) * even).astype(np.float32).ravel())  # what arrives on average: for what blocks a direction
     running = np.zeros(views)
-    beginning = replace(material, colour=mi.Float(material.colour))  # where L_init holds the base colour
-    if saved:
-        beginning.colour = mi.Float(saved["beginning"])
+    exposure = mi.Float((np.exp(model.gains) * even).mean(1).astype(np.float32))
 
     def step(i: int) -> dict:
         nonlocal running
@@ -160,7 +158,7 @@ def fit_collection_surface(
             loss = loss + options.slope_small * dr.mean(dr.select(valid, dr.squared_norm(slope), 0))
             if light.anchor > 0:
                 pull = dr.opaque(mi.Float, light.anchor * 0.1 ** (i / (light.lambda_a * options.steps)))
-                away = surface.base - material_at(beginning, points.uv, valid).base
+                away = surface.base - batch.rgb / dr.gather(mi.Float, exposure, batch.view)
                 loss = loss + pull * dr.mean(dr.select(valid, dr.squared_norm(away), 0))
         dr.backward(loss)
         gradients = [dr.grad(p) for p in params]
@@ -196,7 +194,6 @@ def fit_collection_surface(
 
     def state() -> dict:
         arrays = {"colour": np.array(material.colour), "metallic": np.array(material.metallic), "slope": np.array(material.slope)}
-        arrays["beginning"] = np.array(beginning.colour)
         return {**arrays, "coefficients": model.coefficients, "gains": model.gains, "weights": model.weights}
 
     def textures(uv, valid):
