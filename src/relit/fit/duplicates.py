@@ -30,12 +30,13 @@ from relit.fit.instances import ANOTHER_PHOTO, View, carved, move_poses, moved_p
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
-from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
+from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
+from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.rendering.transport import TraceableMesh
@@ -219,6 +220,8 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         areas = vertex_areas(mesh)
         level = float((parts["radiance"].mean(0) * areas[:, None]).sum() / areas.sum() / 3)
         model = start_surface(start, known, level, o)
+        if options.gaussians:
+            model.gaussians = GaussianLight(options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START)
         fit_surface(bank, TraceableMesh(whole, radiance), model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)
         environment = model.environment.image()

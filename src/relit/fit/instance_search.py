@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from relit.fit.instance_growth import Growth, grow, seen_from
+from relit.cameras.se3 import rotation_angle
+from relit.fit.instance_growth import Growth, chosen_rings, grow, seen_from
 from relit.fit.instances import View, albedo_render, carved, first_pose, fit_model, frame_scale, inflated
 from relit.fit.register import (
     Crop,
@@ -42,6 +43,7 @@ class Search:
     poses are grown from, at most, for each descriptor. convincing: share of the way from chance to a perfect score at which no other start
     is tried. rounds: of fit and search for all instances. descents, descent_rate: fits of shape and poses together that follow, and the
     step of the poses in them. rate: of the pose corrections in other coarse fits. depth: see `carved`.
+    doubted: instances that are searched once more against a model of the others.
     """
 
     nodes: int = 40
@@ -57,6 +59,7 @@ class Search:
     descent_rate: float = 0.012
     rate: float = 0.004
     depth: float = 2.5
+    doubted: int = 6
     growth: Growth = field(default_factory=Growth)
 
 
@@ -165,6 +168,35 @@ def descend(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=P
     return poses, scores
 
 
+def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=PARTS, say=lambda text: None):
+    """Search the instances that agree least once more, each against a model of all others; (poses, scores, number that moved).
+
+    An instance in a wrong place has shaped the model that it is compared with, and so agrees with it; a model without it has no such
+    opinion.
+    """
+    moved = 0
+    for turn, k in enumerate(np.argsort(scores)[: o.doubted]):
+        rest = [j for j in range(len(views)) if j != k]
+        some = [views[j] for j in rest]
+        values = carved(some, poses[rest], o.nodes, 0.15 if len(rest) < 4 else 0.3, o.depth)
+        model, _ = fit_model(some, poses[rest], values, o.steps, seed=seed + turn)
+        render, own = albedo_render(model), chosen_rings(rings, [k])
+        best, score = refine([crops[k]], poses[[k]], render, rings=own, steps=(0, 4.0, 2.0), parts=parts)
+        before = float(score[0])
+        gallery = make_gallery(
+            render, views_from(directions_around(o.viewpoints, seed + turn), float(np.linalg.norm(poses[k][:3, 3]))), parts
+        )
+        found = search([crops[k]], gallery, keep=4, rings=own)
+        for n in range(4):
+            other, also = refine([crops[k]], found.poses[:, n], render, rings=own, steps=(0, 5.0, 2.5), parts=parts)
+            if also[0] > score[0]:
+                best, score = other, also
+        if score[0] > before + 0.01 and rotation_angle(best[0][:3, :3].T @ poses[k][:3, :3]) > 8:
+            say(f"{views[k].label} agrees better elsewhere with the model of the others: {before:.3f} -> {score[0]:.3f}")
+            poses[k], moved = best[0], moved + 1
+    return poses, scores, moved
+
+
 def trusted(scores: np.ndarray, gap: float = GAP) -> np.ndarray:
     """Indices of the instances whose score lies within `gap` of the mean of the best third; at least three."""
     best = np.sort(scores)[::-1]
@@ -211,4 +243,9 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     if skill < o.convincing:
         say(f"note: the poses are uncertain, {skill:.2f} above chance where {o.convincing:.2f} convinces: is the object nearly symmetric?")
     poses, scores = settle(views, crops, rings[parts], poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
-    return descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
+    poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
+    if o.descents and len(views) > 2:
+        poses, scores, moved = reconsider(views, crops, rings[parts], poses, scores, o, seed=seed + 30, parts=parts, say=say)
+        if moved:
+            poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 40, parts=parts, say=say)
+    return poses, scores

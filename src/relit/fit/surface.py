@@ -19,6 +19,7 @@ from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
 from relit.fit.preview import surface_preview
 from relit.lighting.environment import Environment
+from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import MaterialField, material_at, project, slope_at, start_material
 from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 
@@ -81,12 +82,14 @@ class SurfaceOptions:
 @dataclass
 class SurfaceModel:
     """material: the textures. log_light: Float [rows * 2 rows * 3], log radiance, lat-long in the unit frame. environment: exp of it.
-    normals: (S, S, 3) unit normals of the texels, or None."""
+    normals: (S, S, 3) unit normals of the texels, or None. gaussians: what log_light is rendered from, where the light is to be spherical
+    Gaussians, or None."""
 
     material: MaterialField
     log_light: Any
     environment: Environment
     normals: np.ndarray | None = None
+    gaussians: GaussianLight | None = None
 
 
 def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions, normals=None) -> SurfaceModel:
@@ -103,22 +106,32 @@ def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options:
     return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h), normals)
 
 
+def light_parameters(model: SurfaceModel):
+    """What is optimised of the light (Float)."""
+    return model.log_light if model.gaussians is None else model.gaussians.parameters
+
+
 def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, options: SurfaceOptions, stage, seed: int = 0) -> SurfaceModel:
     """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when there is one."""
-    material, environment = model.material, model.environment
+    material, environment, gaussians = model.material, model.environment, model.gaussians
     first = 0
     saved = stage.load("checkpoint")
     if saved:
         first = int(saved["step"])
         material.colour, material.metallic = mi.Float(saved["colour"]), mi.Float(saved["metallic"])
         material.slope = mi.Float(saved["slope"])
-        model.log_light = mi.Float(saved["light"])
+        if gaussians is None:
+            model.log_light = mi.Float(saved["light"])
+        else:
+            gaussians.parameters = mi.Float(saved["light"])
+    if gaussians is not None:
+        model.log_light = gaussians.log_radiance()
     environment.radiance = dr.exp(model.log_light)
     environment.rebuild()
     count = options.points
     rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
     exchange = Exchange(model.normals, material.size**2, options.light, options.exchange_rows)
-    adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, model.log_light))
+    adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, light_parameters(model)))
     adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
     ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
     ratio = mi.Float(ratio)
@@ -147,9 +160,10 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         # opaque: the weight must not become a literal
         colour_smoothing = dr.opaque(mi.Float, options.smooth_colour)
 
-        params = [material.colour, material.metallic, model.log_light, material.slope]
+        params = [material.colour, material.metallic, light_parameters(model), material.slope]
         dr.enable_grad(*params)
-        environment.radiance = dr.exp(model.log_light)
+        log_light = model.log_light if gaussians is None else gaussians.log_radiance()
+        environment.radiance = dr.exp(log_light)
         surface = material_at(material, points.uv, valid)
         slope = slope_at(material, points.uv, valid)
         points.n = smooth_n
@@ -158,7 +172,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         a, b = reflected(points, lights, surface, environment)
         fit = dual_loss(a, b, batch.rgb, valid)
         lit = brightness(batch.rgb, surface.base, valid, options.smooth_shade)
-        prior = material_prior(material, surface, near, valid, options, colour_smoothing * lit) + light_prior(model.log_light, options)
+        prior = material_prior(material, surface, near, valid, options, colour_smoothing * lit) + light_prior(log_light, options)
         prior += parsimony(material, surface, points.uv, valid, shift, options) + slope_prior(material, bend, close, valid, options)
         dr.backward(fit + prior)
         gradients = [dr.grad(p) for p in params]
@@ -166,10 +180,16 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         dr.eval(gradients, fit)
         material.colour = adam_colour.step(dr.detach(material.colour), gradients[0], options.colour_rate * decay * warm, ratio)
         material.metallic = adam_metallic.step(dr.detach(material.metallic), gradients[1], options.metallic_rate * decay)
-        model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * decay)
+        if gaussians is None:
+            model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * decay)
+        else:
+            rate = options.light_rate * decay
+            gaussians.parameters = adam_light.step(dr.detach(gaussians.parameters), gradients[2], rate, gaussians.rates)
+            gaussians.project()
+            model.log_light = gaussians.log_radiance()
         slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
         material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
-        if options.exchange_rate > 0:
+        if options.exchange_rate > 0 and gaussians is None:
             if i % REFRESH == 0 or i == first:
                 exchange.refresh(environment.image())
             dr.eval(material.colour, model.log_light)
@@ -183,7 +203,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         return {"colour": fit}
 
     def state() -> dict:
-        names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": model.log_light}
+        names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": light_parameters(model)}
         return {name: np.array(value) for name, value in names.items()}
 
     def textures(uv, valid):
