@@ -42,8 +42,8 @@ class Search:
     within which another can be recognised. models: instances that are inflated, at most. keep: guesses for each pair. starts: pairs that
     poses are grown from, at most, for each descriptor. convincing: share of the way from chance to a perfect score at which no other start
     is tried. rounds: of fit and search for all instances. descents, descent_rate: fits of shape and poses together that follow, and the
-    step of the poses in them. rate: of the pose corrections in other coarse fits. depth: see `carved`.
-    doubted: instances that are searched once more against a model of the others.
+    step of the poses in them. rate: of the pose corrections in other coarse fits. depth: see `carved`. doubted, rounds_doubted: instances
+    that are searched once more against a model of the others, and how often at most.
     """
 
     nodes: int = 40
@@ -60,6 +60,7 @@ class Search:
     rate: float = 0.004
     depth: float = 2.5
     doubted: int = 6
+    rounds_doubted: int = 2
     growth: Growth = field(default_factory=Growth)
 
 
@@ -244,8 +245,9 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         say(f"note: the poses are uncertain, {skill:.2f} above chance where {o.convincing:.2f} convinces: is the object nearly symmetric?")
     poses, scores = settle(views, crops, rings[parts], poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
     poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
-    if o.descents and len(views) > 2:
-        poses, scores, moved = reconsider(views, crops, rings[parts], poses, scores, o, seed=seed + 30, parts=parts, say=say)
-        if moved:
-            poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 40, parts=parts, say=say)
+    for turn in range(o.rounds_doubted if o.descents and len(views) > 2 else 0):
+        poses, scores, moved = reconsider(views, crops, rings[parts], poses, scores, o, seed=seed + 30 + turn, parts=parts, say=say)
+        if not moved:
+            break
+        poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 40 + turn, parts=parts, say=say)
     return poses, scores
