@@ -25,6 +25,8 @@ from relit.geometry.sdf import dense_values, node_positions, resample
 from relit.rendering.march import march, sphere_interval
 from relit.scene import Camera
 
+KEEP = (0.3, 0.15, 0.05, 0.0)  # share of the photos in which a node is bare and so stays, turn after turn
+
 
 @dataclass(frozen=True)
 class HollowOptions:
@@ -148,7 +150,9 @@ def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: Hollo
         return None
     far = inside & (distance_transform_edt(~good) > o.wall)
     gone = binary_propagation(bad & far, mask=far)
-    gone &= ~binary_dilation(bare(cameras, inside & ~gone, gone), iterations=2)  # a handle keeps its root
+    for votes in KEEP:  # a handle is bare in most photos; what is behind a handle that is gone is so in few
+        need = bare(cameras, inside & ~gone, gone) > votes * len(cameras)
+        gone &= ~binary_dilation(need, iterations=2)  # and its root stays with it
     left = inside & ~gone
     if gone.sum() < o.least or not left.any():
         return None
@@ -156,12 +160,12 @@ def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: Hollo
 
 
 def bare(cameras: list[Camera], left: np.ndarray, gone: np.ndarray) -> np.ndarray:
-    """Which nodes of `gone` some camera sees with nothing of `left` behind or before them: without them the silhouette would have a hole.
-    left, gone: (n, n, n) bool."""
+    """(n, n, n) int: how many cameras see a node of `gone` with nothing of `left` behind or before it: without it the silhouette would have a
+    hole. left, gone: (n, n, n) bool."""
     n = left.shape[0]
     p = node_positions(n)
     solid, asked = p[left].astype(np.float64), p[gone].astype(np.float64)
-    out = np.zeros(len(asked), bool)
+    out = np.zeros(len(asked), int)
     for camera in cameras:
         scale = np.linalg.norm(camera.centre) * 0.5 * (n - 1) / camera.fx  # a voxel at the centre is a pixel of the small picture
         w, h = (max(2, round(side * scale)) for side in (camera.width, camera.height))
@@ -170,8 +174,8 @@ def bare(cameras: list[Camera], left: np.ndarray, gone: np.ndarray) -> np.ndarra
         cover[rows, columns] = True
         cover = binary_dilation(cover, np.ones((3, 3), bool))
         columns, rows, seen = small_pixels(camera, asked, w, h)
-        out[seen] |= ~cover[rows, columns]
-    found = np.zeros_like(gone)
+        out[seen] += ~cover[rows, columns]
+    found = np.zeros(gone.shape, int)
     found[gone] = out
     return found
 
