@@ -160,8 +160,8 @@ def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: Hollo
 
 
 def bare(cameras: list[Camera], left: np.ndarray, gone: np.ndarray) -> np.ndarray:
-    """(n, n, n) int: how many cameras see a node of `gone` with nothing of `left` behind or before it: without it the silhouette would have a
-    hole. left, gone: (n, n, n) bool."""
+    """(n, n, n) int: how many cameras see a node of `gone` with nothing of `left` behind or before it: without it the silhouette would
+    have a hole. left, gone: (n, n, n) bool."""
     n = left.shape[0]
     p = node_positions(n)
     solid, asked = p[left].astype(np.float64), p[gone].astype(np.float64)
