@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from relit.asset.asset import save_asset
-from relit.asset.export import export_asset
+from relit.asset.export import export_asset, write_mitsuba
 from relit.asset.gltf import read_asset_file
 from relit.errors import UserError
 from relit.rendering.mitsuba_scene import build_scene, render
+from relit.scene import Flash
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +58,25 @@ def test_mitsuba_scene_renders_like_the_asset(folder, asset, tmp_path):
     assert inside.sum() > 100
     a, b = picture[..., :3][inside].clip(0, 1), ours[..., :3][inside].clip(0, 1)
     assert -10 * np.log10(np.mean((a - b) ** 2)) > 25  # noise; a shift of one pixel costs more
+    assert np.abs(a.mean(0) - b.mean(0)).max() < 0.01
+
+
+def test_mitsuba_scene_of_a_rough_plastic_renders_like_the_asset(asset, tmp_path):
+    from relit.rendering.flash_scene import build_flash_scene, render_flash
+
+    size = asset.material.base_color.shape[:2]
+    ramp = np.linspace(0.35, 0.65, size[1], dtype=np.float32)[None].repeat(size[0], 0)
+    material = replace(asset.material, roughness=ramp, metallic=np.zeros((1, 1), np.float32), specular=1.2 - ramp, ior=1.49, normal=None)
+    camera = asset.cameras[0][1]
+    flash = Flash(np.array([-0.2, -0.1, 0.0]), np.full(3, 3 * float(np.sum(camera.centre**2))))
+    plastic = replace(asset, material=material, flash=flash, environment=None)
+    write_mitsuba(tmp_path / "scene", plastic)
+    picture = np.array(mi.render(mi.load_file(str(tmp_path / "scene" / "scene.xml")), spp=64))[..., :3]
+    ours = render_flash(build_flash_scene(plastic.mesh, material, plastic.world_from_asset), camera, flash, 64, max_depth=6)
+    inside = ours[..., 3] > 0.999
+    a, b = picture[inside].clip(0, 1), ours[..., :3][inside].clip(0, 1)
+    assert inside.sum() > 100 and b.max() > 0.3
+    assert -10 * np.log10(np.mean((a - b) ** 2)) > 28
     assert np.abs(a.mean(0) - b.mean(0)).max() < 0.01
 
 

@@ -10,6 +10,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from relit.asset.asset import find_asset, load_asset, save_textures
+from relit.asset.mitsuba_plastic import flash_emitter, plastic_bsdf
 from relit.asset.obj import write_obj
 from relit.conventions import srgb_from_linear, world_from_mitsuba_camera
 from relit.errors import UserError, did_you_mean
@@ -84,7 +85,8 @@ def _matrix(m: np.ndarray) -> str:
 
 
 def write_mitsuba(folder: Path, asset: Asset) -> list[Path]:
-    """A folder that `mitsuba scene.xml` renders: object.ply, textures/, environment.exr, the first camera, Mitsuba's `principled` BSDF.
+    """A folder that `mitsuba scene.xml` renders: object.ply, textures/, environment.exr, the first camera, Mitsuba's `principled` BSDF;
+    of a flash capture Mitsuba's `roughplastic` and the flash of that camera.
 
     Two departures from Relit's own renderer, both Mitsuba's: no energy compensation on rough metal, no specular map.
     """
@@ -109,6 +111,8 @@ def write_mitsuba(folder: Path, asset: Asset) -> list[Path]:
         f'<float name="eta" value="{asset.material.ior:.6g}"/>',
         "</bsdf>",
     ]
+    if asset.flash is not None:
+        bsdf = plastic_bsdf(folder, asset.material)
     if asset.material.normal is not None:
         map_ = texture("normal").replace('name="normal"', 'name="normalmap"', 1)
         bsdf = ['<bsdf type="normalmap">', map_, *bsdf, "</bsdf>"]
@@ -130,6 +134,7 @@ def write_mitsuba(folder: Path, asset: Asset) -> list[Path]:
     if asset.environment is not None:
         write_linear(folder / "environment.exr", environment_bitmap(asset.environment))
         lines.append('<emitter type="envmap"><string name="filename" value="environment.exr"/></emitter>')
+    lines += flash_emitter(asset)
     lines += ['<shape type="ply"><string name="filename" value="object.ply"/>', _matrix(asset.world_from_asset)]
     lines += ['<bsdf type="twosided">', *bsdf, "</bsdf>", "</shape>", "</scene>"]
     write_bytes(folder / "scene.xml", ("\n".join(lines) + "\n").encode())
