@@ -90,6 +90,7 @@ MULTIVIEW = Suite(
         "white": ("without=white",),
         "parsimony": ("without=parsimony",),
         "normal_map": ("without=normal_map",),
+        "metal_start": ("without=metal_start",),
         "priors": ("without=material_prior,colour_smoothing,light_prior",),
     },
 )

@@ -20,6 +20,7 @@ from relit.conventions import move_points, move_pose, similarity, srgb_from_line
 from relit.errors import UserError, did_you_mean
 from relit.files import write_text
 from relit.fit.explore import explore, first_shape
+from relit.fit.metal import PAINT, metal_start
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras, sphere_pixels
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
@@ -82,6 +83,7 @@ WITHOUT = {  # what an ablation switches off: settings of the surface pass
     "light_prior": {"light_smooth": 0.0, "light_neutral": 0.0},
     "parsimony": {"parsimony": 0.0},
     "normal_map": {"slope_rate": 0.0},
+    "metal_start": {},  # every place begins as paint
 }
 
 PRESETS = {
@@ -302,9 +304,14 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
         start = fill_gutters(interpolate(guess, mesh.faces, face, bary), known)
         mean = float((radiance * areas[:, None]).sum() / areas.sum() / 3)
         normals = fill_gutters(interpolate(mesh.normals, mesh.faces, face, bary), known)
-        model = start_surface(start, known, mean, o, normals)
         reflecting = radiance * (0.0 if "interreflection" in options.without else 1.0)
-        fit_surface(bank, TraceableMesh(mesh, reflecting), model, o, stage, seed)
+        traced = TraceableMesh(mesh, reflecting)
+        metallic = PAINT
+        if "metal_start" not in options.without and stage.load("checkpoint") is None:
+            metallic = metal_start(bank, traced, start, known, mean, normals, o, seed)
+            run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
+        model = start_surface(start, known, mean, o, normals, metallic)
+        fit_surface(bank, traced, model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)
         maps = {
             "base_color": fill_gutters(base, known),

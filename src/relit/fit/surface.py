@@ -92,15 +92,17 @@ class SurfaceModel:
     gaussians: GaussianLight | None = None
 
 
-def start_surface(base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions, normals=None) -> SurfaceModel:
+def start_surface(
+    base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions, normals=None, metallic=0.1
+) -> SurfaceModel:
     """base: (S, S, 3) first guess of the base colour up to scale (materials.intrinsic), known: (S, S) bool, radiance: mean over the object,
-    normals: (S, S, 3) of the texels, None where they stand in many places.
+    normals: (S, S, 3) of the texels, None where they stand in many places. metallic: a number or (S, S).
 
     The light starts grey and even, bright enough that the mean base colour is ALBEDO_START.
     """
     mean = float(base[known].mean())
     albedo = np.clip(base * (ALBEDO_START / max(mean, 1e-6)), 0.02, 0.95)
-    material = start_material(options.texture, albedo, options.roughness_start, 0.1)
+    material = start_material(options.texture, albedo, options.roughness_start, metallic)
     h = options.light
     log_light = mi.Float(np.full(h * 2 * h * 3, np.log(max(radiance, 1e-4) / ALBEDO_START), np.float32))
     return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h), normals)
@@ -215,12 +217,17 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
 
 
 def dual_loss(a, b, target, valid):
-    """Mean of display_weight (a - L*)(b - L*) over points and channels; a and b are independent estimates of L, so this is unbiased for the
+    """Mean of `dual_values` over valid points."""
+    return weighted_mean(dual_values(a, b, target), dr.select(valid, mi.Float(1), 0))
+
+
+def dual_values(a, b, target):
+    """display_weight (a - L*)(b - L*), mean over channels (Float); a and b are independent estimates of L, so this is unbiased for the
     squared error. A pixel whose file value is saturated only says "at least this bright"."""
     value = (a - target) * (b - target) * display_weight(target)
     mean = dr.detach((a + b) * 0.5)
     value = dr.select((target >= 0.99) & (mean > target), 0, value)
-    return weighted_mean((value.x + value.y + value.z) / 3, dr.select(valid, mi.Float(1), 0))
+    return (value.x + value.y + value.z) / 3
 
 
 def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points:

@@ -1,0 +1,91 @@
+"""Where the object may be metal, before the surface pass begins.
+
+Metal or not is a choice between two explanations of the same photos: colour that the surface scatters, or colour that it reflects.
+Between them lies a barrier that a descent does not cross: a metal that starts as paint ends as glossy paint under a wrong light. So the
+whole object is fitted twice, shortly and coarsely, from either side, and each group of like colours begins on the side that explains its
+pixels better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.cluster.vq import kmeans2, vq
+
+from relit.fit.loop import NoStage
+from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.surface import SurfaceModel, SurfaceOptions, dual_values, fit_surface, start_surface
+from relit.materials.field import material_at
+from relit.rendering.transport import TraceableMesh, first_hits, reflected, sample_lights
+
+SIDES = (0.1, 0.5)  # first metallic of the two fits
+GROUPS = 6  # of like colours
+GAIN = 0.13  # the error must fall by this share; from the wrong side it rises, or falls by less than a tenth
+FLOOR = 0.005  # of the error of a pixel: what is explained so well needs no other explanation
+STAYED = 0.4  # mean metallic of a group that is metal, after the short fit
+PAINT, METAL = 0.1, 0.9  # first metallic of the pass itself
+STEPS = 300  # of each fit, but at most half of those of the pass
+TEXTURE = 128  # texels a side
+TRIAL = {"texture": TEXTURE, "slope_rate": 0.0, "metallic_sparse": 0.003, "metallic_binary": 0.003}
+BATCHES = 4  # of pixels that the fits are judged by
+
+
+def metal_start(
+    bank: PixelBank, mesh: TraceableMesh, base: np.ndarray, known: np.ndarray, radiance: float, normals, options: SurfaceOptions, seed=0
+) -> np.ndarray:
+    """(S, S) float32, the metallic to begin with. base, known, radiance, normals: as of `start_surface`."""
+    o = replace(options, steps=min(STEPS, options.steps // 2), **TRIAL)
+    small = [cv2.resize(np.asarray(a, np.float32), (TEXTURE, TEXTURE), interpolation=cv2.INTER_AREA) for a in (base, known, normals)]
+    fits = []
+    for side in SIDES:
+        model = start_surface(small[0], small[1] > 0.5, radiance, o, small[2], side)
+        fits.append(fit_surface(bank, mesh, model, o, NoStage(), seed))
+    colour = np.sqrt(np.maximum(base, 0) / max(float(base[known].mean()), 1e-6))
+    centres, group = groups_of(colour, known)
+    metal = better_as_metal(*(errors(bank, mesh, f, o, centres, colour, seed) for f in fits))
+    return np.where(metal[group] & known, METAL, PAINT).astype(np.float32)
+
+
+def groups_of(colour: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (G, 3) of at most GROUPS groups of like colours, and the group of each texel (S, S)."""
+    some = colour[known]
+    some = some[:: max(1, len(some) // 20000)].astype(np.float64)
+    distinct = np.unique(some.round(2), axis=0)
+    centres = kmeans2(some, GROUPS, minit="++", rng=0)[0] if len(distinct) > 2 * GROUPS else distinct
+    return centres, vq(colour.reshape(-1, 3), centres)[0].reshape(known.shape)
+
+
+def errors(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, o: SurfaceOptions, centres, colour, seed: int) -> np.ndarray:
+    """(G, 3), for each group: the error of display values and the metallic, both summed over drawn pixels, and the pixels counted."""
+    size, groups = colour.shape[0], len(centres)
+    rng = mi.PCG32(size=o.points, initstate=seed * 7919 + 29)
+    out = np.zeros((groups, 3))
+    for _ in range(BATCHES):
+        pixel = draw_pixels(bank, rng, o.points)
+        dr.eval(pixel, rng)
+        batch = batch_of(bank, pixel)
+        points = first_hits(mesh, batch.o, batch.d)
+        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
+        points.valid = valid
+        dr.eval(points, batch.rgb)
+        surface = material_at(model.material, points.uv, valid)
+        dr.eval(surface.base, surface.roughness, surface.metallic)
+        lights = sample_lights(mesh, points, surface, model.environment, o.directions, rng)
+        a, b = reflected(points, lights, surface, model.environment)
+        value = dual_values(a, b, batch.rgb)
+        keep = np.array(valid)
+        uv = np.clip((np.array(points.uv).T * size).astype(int), 0, size - 1)[keep]
+        group = vq(colour[uv[:, 1], uv[:, 0]], centres)[0]
+        for column, values in enumerate((np.array(value)[keep], np.array(surface.metallic)[keep], np.ones(len(group)))):
+            out[:, column] += np.bincount(group, values, groups)
+    return out
+
+
+def better_as_metal(paint: np.ndarray, metal: np.ndarray) -> np.ndarray:
+    """(G,) bool from the `errors` of the two fits: whether a group is explained clearly better from the metal's side, and stayed there."""
+    gain = (paint[:, 0] - metal[:, 0]) / (paint[:, 0] + FLOOR * paint[:, 2] + 1e-9)
+    return (gain > GAIN) & (metal[:, 1] > STAYED * metal[:, 2])
