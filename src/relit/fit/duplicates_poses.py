@@ -55,7 +55,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
             raise UserError("hardly any instance could be placed", "see the scores in the log", "check the label image", code=EXIT_FAILED)
         for k in np.flatnonzero(~registered):
             run.say(f"note: the object with {named(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only")
-        if len(views) > 1 and scores[registered].std() < 0.004 and scores.min() > 0.97:
+        if len(views) > 1 and scores[registered].std() < 0.002 and scores.min() > 0.985:
             run.say("note: all poses fit equally well: a symmetric or textureless object leaves them ambiguous")
         poses = centred(views, poses, registered)
         keys = np.array([v.key for v in views])
