@@ -11,7 +11,7 @@ import pytest
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_growth import Growth, grow, linked_poses
-from relit.fit.instance_search import Guesses, Search, crops_of, first_pairs, place, trusted
+from relit.fit.instance_search import Guesses, Search, crops_of, first_pairs, place, reconsider, trusted
 from relit.fit.instances import carved, first_pose, fit_model, frame_scale, inflated, pixel_bank, views_of
 from relit.fit.pile_scene import find_ground
 from relit.fit.register import crop_rings
@@ -166,6 +166,21 @@ def test_poses_are_found_from_silhouettes_and_colours_alone():
     assert any("uncertain" in text for text in said)
     alone, score = place(views[:1], o)
     assert alone.shape == (1, 4, 4) and score.tolist() == [1.0]
+
+
+def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
+    views, truth = painted([0, 20, 40, 60])
+    parts = (0.6, 2.0, 0.1)
+    crops = crops_of(views)
+    wrong = exp_so3(np.array([0.0, np.radians(70), 0.0]))
+    poses = truth.copy()
+    poses[1] = similarity(wrong, np.zeros(3)) @ truth[1]
+    o = Search(nodes=24, steps=12, viewpoints=300, doubted=1)
+    found, _, moved = reconsider(views, crops, crop_rings(crops, parts), poses, np.array([0.9, 0.6, 0.9, 0.9]), o, seed=0, parts=parts)
+    assert moved == 1 and rotation_angle(found[1][:3, :3].T @ truth[1][:3, :3]) < 15
+    assert np.array_equal(found[[0, 2, 3]], truth[[0, 2, 3]])
+    again = reconsider(views, crops, crop_rings(crops, parts), found.copy(), np.array([0.9, 0.6, 0.9, 0.9]), o, seed=0, parts=parts)
+    assert again[2] == 0  # what stands rightly stays
 
 
 def test_instances_with_low_scores_are_not_trusted():

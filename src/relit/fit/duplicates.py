@@ -43,7 +43,7 @@ from relit.rendering.transport import TraceableMesh
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 
 __all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
-LIGHT = "one photo of several identical objects under one light is assumed (duplicates)"  # what `relit inspect` says
+LIGHT = "several identical objects under one light are assumed (duplicates)"  # what `relit inspect` says
 STAGES = ("poses", "volume", "mesh", "surface")
 FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
