@@ -1,4 +1,4 @@
-"""Neural-PIL's light network: reading, derivatives, refusals. The network itself is not ours to ship: a random one of its shape stands in."""
+"""Neural-PIL's light network: reading, derivatives, refusals. It is not ours to ship: a random one of its shape stands in."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def test_what_is_no_network_is_refused(tmp_path, wrong):
     if wrong != "nowhere":
         folder.mkdir()
     if wrong in ("shape", "codes", "no codes"):
-        write_network(folder, SHAPES[:-1] + ((7,),) if wrong == "shape" else SHAPES)
+        write_network(folder, (*SHAPES[:-1], (7,)) if wrong == "shape" else SHAPES)
     if wrong == "pickled":
         np.save(folder / "network.npy", np.array([np.zeros(3), np.zeros(4)], dtype=object), allow_pickle=True)
     if wrong == "object array":
