@@ -116,7 +116,7 @@ FLASH = Suite(
         "flash_angle": ("<=", 0.2),
     },
     ablations={name: (f"without={name}",) for name in ("offset", "shadow", "interreflection", "features", "refinement")}
-    | {"offset+shadow": ("without=offset,shadow",)},
+    | {"offset+shadow": ("without=offset,shadow",), "hollows": ("hollows=0",)},
 )
 
 LIGHTS = tuple(
