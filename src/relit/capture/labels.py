@@ -9,6 +9,7 @@ import numpy as np
 
 from relit.capture.frames import read_json
 from relit.errors import UserError
+from relit.masks.rle import runs_from
 
 LEAST_SIDE = 24  # pixels; smaller objects carry no pose
 MOST = 1000  # objects
@@ -95,13 +96,16 @@ def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
 
 def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
     data = read_json(file)
-    names = {i.get("id"): i for i in data["images"] if isinstance(i, dict)}
-    entry = next((i for i in names.values() if Path(str(i.get("file_name", ""))).name == photo.name), None)
-    if entry is None and len(names) == 1:
-        entry = next(iter(names.values()))
+    images = [i for i in data["images"] if isinstance(i, dict)]
+    entry = next((i for i in images if Path(str(i.get("file_name", ""))).name == photo.name), None)
+    if entry is None and len(images) == 1:
+        entry = images[0]
     if entry is None:
         raise UserError(f"the annotations do not name the photo {photo.name}", fix=f"check `images`: {file}")
-    sx, sy = shape[1] / float(entry.get("width", shape[1])), shape[0] / float(entry.get("height", shape[0]))
+    size = [entry.get("height", shape[0]), entry.get("width", shape[1])]
+    if not all(isinstance(v, (int, float)) and 1 <= v < 1e6 for v in size):
+        raise UserError(f"the annotations give the photo {photo.name} the size {size}", fix=f"check `images`: {file}")
+    sx, sy = shape[1] / size[1], shape[0] / size[0]
     labels, k = np.zeros(shape, np.int32), 0
     for a in data["annotations"]:
         if not isinstance(a, dict) or a.get("image_id") != entry.get("id"):
@@ -110,43 +114,16 @@ def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
         s = a.get("segmentation")
         try:
             if isinstance(s, dict):
-                mask = run_lengths(s)
+                mask = runs_from(s, f"annotation {k}").decode()
                 labels[cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = k
             else:
-                polygons = [np.round(np.array(p, np.float64).reshape(-1, 2) * (sx, sy)).astype(np.int32) for p in s]
-                cv2.fillPoly(labels, polygons, k)
+                polygons = [np.round(np.array(p, np.float64).reshape(-1, 2) * (sx, sy)) for p in s]
+                if not all((np.abs(p) < 1e6).all() for p in polygons):
+                    raise ValueError("corners far outside the photo")
+                cv2.fillPoly(labels, [p.astype(np.int32) for p in polygons], k)
         except (TypeError, ValueError, KeyError, OverflowError, cv2.error) as error:
             raise UserError(f"annotation {k} has no usable segmentation", str(error), f"polygons or run lengths: {file}") from None
     return labels
-
-
-def run_lengths(s: dict) -> np.ndarray:
-    """A COCO mask (H, W) uint8: column-major runs of 0 and 1 in turn, as numbers or in COCO's compressed text."""
-    h, w = (int(x) for x in s["size"])
-    if not 0 < h * w <= 1 << 28:
-        raise ValueError("the size makes no sense")
-    counts = s["counts"]
-    if isinstance(counts, str):
-        counts = uncompressed(counts)
-    counts = np.asarray(counts, np.int64)
-    if (counts < 0).any() or counts.sum() != h * w:
-        raise ValueError("the runs do not fill the picture")
-    return np.repeat(np.arange(len(counts)) % 2, counts).astype(np.uint8).reshape(w, h).T
-
-
-def uncompressed(text: str) -> list[int]:
-    """Runs of COCO's text form: six bits a letter, the sixth says that more follow, from the third run on differences."""
-    out, i = [], 0
-    while i < len(text):
-        value, shift, more = 0, 0, True
-        while more:
-            c = ord(text[i]) - 48
-            value |= (c & 31) << shift
-            more, i, shift = bool(c & 32), i + 1, shift + 5
-            if not more and c & 16:
-                value |= -1 << shift
-        out.append(value + out[-2] if len(out) > 2 else value)
-    return out
 
 
 def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[str]]:

@@ -126,7 +126,7 @@ def direction_of(answers: list, name: str = "", path: Path | str = "") -> np.nda
     """(3,) unit direction of SAMURAI's three answers. Raises UserError for words that are none, and for 'Center' three times."""
     out = np.zeros(3)
     for answer in answers:
-        if answer in ANSWERS:
+        if isinstance(answer, str) and answer in ANSWERS:
             axis, sign = ANSWERS[answer]
             out[axis] = sign
         elif answer != "Center":
@@ -151,10 +151,12 @@ def quadrant_of(direction: np.ndarray) -> list[str]:
 
 def _angles(content: dict, path: Path, names: list[str]) -> Hints:
     azimuths, elevations = content.get("azimuths"), content.get("elevations", [])
-    numbers = [*(azimuths or []), *(elevations or [])]
-    if not all(isinstance(v, (int, float)) and np.isfinite(v) for v in numbers) or not len(azimuths) == len(elevations) == len(names):
+    azimuths, elevations = (list(v) if isinstance(v, list) else [] for v in (azimuths, elevations))
+    numbers = all(isinstance(v, (int, float)) and abs(v) < 1e6 for v in (*azimuths, *elevations))
+    if not numbers or not len(azimuths) == len(elevations) == len(names):
         raise UserError(
-            f"metadata.json has {len(azimuths or [])} azimuths and {len(elevations or [])} elevations for {len(names)} photos",
+            f"metadata.json has {len(azimuths)} azimuths and {len(elevations)} elevations for {len(names)} photos"
+            + ("" if numbers else ", and not all are numbers"),
             "there must be one of each for every photo, in order of name",
             f"mend the file: {path}",
         )
