@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,6 +135,15 @@ def test_other_settings_and_replaced_photos_are_refused(capsys, tmp_path, captur
     assert len(CALLS) == 2
 
 
+def test_photos_whose_camera_is_not_found_are_no_changed_input(capsys, tmp_path, capture, monkeypatch):
+    import relit.reconstruct as job
+
+    monkeypatch.setattr(job, "with_cameras", lambda capture, *rest: replace(capture, photos=capture.photos[:-1]))
+    code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--device", "cpu")
+    assert code == 0, err
+    assert (tmp_path / "run" / "asset" / "object.glb").is_file()
+
+
 def test_a_failed_fit_leaves_no_asset_and_its_log(capsys, tmp_path, capture):
     STOP.append(ZeroDivisionError("the fit"))
     code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
@@ -152,8 +162,6 @@ def test_estimate_grows_with_photos_and_quality(capture, monkeypatch):
 
 
 def test_estimate_at_the_measured_capture_is_what_was_measured(capture):
-    from dataclasses import replace
-
     from relit.plan import MEASURED, MEASURED_PHOTOS
 
     opened = open_input(capture, Job())

@@ -61,11 +61,12 @@ def reconstruct(
             run.say(f"this run is complete: {asset_folder}")
             return asset_folder
         _begin(run, capture, chosen, cost)
+        given = capture  # photos whose cameras are not found are left out of what follows
         if not getattr(recipe, "FINDS_CAMERAS", False):
             capture = with_cameras(capture, run, job)
         if not finished:
             asset = recipe.reconstruct(capture, run, options, job.seed)
-            unchanged(run, capture)
+            unchanged(run, given)
             _save(run, asset, capture, kind, job, chosen)
         if not (run.folder / "photos" / "index.json").is_file():
             from relit.viewer.photos import write_photos
