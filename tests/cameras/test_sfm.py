@@ -113,6 +113,18 @@ def test_textureless_photos_are_refused_with_the_reason(tmp_path):
     assert caught.value.code == EXIT_FAILED and "4 have fewer than 150 features" in caught.value.why
 
 
+def test_four_photos_of_forty_are_no_capture(folder, tmp_path):
+    room = tmp_path / "room"
+    room.mkdir()
+    for i in range(1, 5):
+        (room / f"{i}.png").write_bytes((folder / "images" / f"{i}.png").read_bytes())
+    for i in range(36):
+        images.write_srgb(room / f"blank{i}.png", np.full((HEIGHT, WIDTH, 3), 0.4))
+    with pytest.raises(UserError, match="too few cameras were found: 4 of 40") as caught:
+        find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focal=FOCAL)
+    assert caught.value.code == EXIT_FAILED and "36 have fewer than 150 features" in caught.value.why
+
+
 def test_two_photos_are_too_few(folder, tmp_path):
     capture = open_capture(folder, masks="none")
     with pytest.raises(UserError, match="2 photos are not enough"):

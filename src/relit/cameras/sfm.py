@@ -27,6 +27,7 @@ from relit.scene import Capture, Photo, Sphere
 MAX_SIDE = 1600  # pixels; features are found on copies of at most this size
 EXHAUSTIVE = 120  # photos; larger captures are matched along their order of name
 ENOUGH = 0.9  # share of registered photos at which no further try is made
+LEAST, LEAST_SHARE = 3, 0.15  # registered photos, and their share, below which no shape is worth the wait
 FEW_FEATURES, FEW_MATCHES = 150, 15  # below these a photo is called textureless, without overlap
 SMALL_MASK = 256
 
@@ -84,7 +85,7 @@ def find_cameras(
     say: told what is being done, a line at a time.
     workdir: a folder of its own. The model found stays there: a second call with the same photos reads it instead of searching again.
     The frame is COLMAP's (arbitrary, scale as well).
-    Raises UserError (exit code 4) when fewer than three photos can be registered.
+    Raises UserError (exit code 4) when fewer than three photos, or 15 % of them, can be registered.
     """
     pycolmap = load_pycolmap()
 
@@ -119,9 +120,9 @@ def find_cameras(
                 break
     seconds = time.monotonic() - began
     reason = _reason(best, photos, names, features)
-    if best.count < 3:
+    if best.count < max(LEAST, LEAST_SHARE * len(photos)):
         raise UserError(
-            f"no cameras were found: {best.count} of {len(photos)} photos registered",
+            f"{'no' if best.count < LEAST else 'too few'} cameras were found: {best.count} of {len(photos)} photos registered",
             reason,
             "take sharp photos that overlap by two thirds, with texture in view (a newspaper under a plain object), or give cameras",
             code=EXIT_FAILED,
