@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_propagation, distance_transform_edt, gaussian_filter
 
+from relit.fit.loop import NoStage
 from relit.fit.losses import display_weight
 from relit.fit.pixels import PixelBank, batch_of
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
@@ -51,28 +52,6 @@ class HollowOptions:
     blur: float = 1.5
 
 
-class _NoStage:
-    """Trials keep nothing and report nothing."""
-
-    def load(self, name):
-        return None
-
-    def save(self, name, **arrays):
-        pass
-
-    def step(self, i, **losses):
-        pass
-
-    def preview_due(self):
-        return False
-
-    def preview(self, render):
-        pass
-
-    def checkpoint_due(self):
-        return False
-
-
 def open_hollows(
     bank: PixelBank,
     cameras: list[Camera],
@@ -91,7 +70,7 @@ def open_hollows(
 
     def fitted(v: np.ndarray):
         model = start(v)
-        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), _NoStage(), seed)
+        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), NoStage(), seed)
         return dense_values(model.grid), *surface_error(bank, model, o, seed)
 
     shape, error, where = fitted(values)

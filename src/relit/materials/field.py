@@ -30,8 +30,8 @@ class MaterialField:
 def start_material(size: int, base: np.ndarray, roughness: float, metallic, f0: float = 0.04) -> MaterialField:
     """base: (size, size, 3) linear start of the base colour. metallic: a number or (size, size)."""
     colour = np.concatenate([base, np.full((size, size, 1), roughness)], -1).astype(np.float32)
-    flat = dr.zeros(mi.Float, size * size * 2)
-    return MaterialField(size, mi.Float(colour.ravel()), mi.Float(np.broadcast_to(np.asarray(metallic, np.float32), (size, size)).ravel()), flat, f0)
+    metal = np.broadcast_to(np.asarray(metallic, np.float32), (size, size))
+    return MaterialField(size, mi.Float(colour.ravel()), mi.Float(metal.ravel()), dr.zeros(mi.Float, size * size * 2), f0)
 
 
 def texels_at(field: MaterialField, uv):
