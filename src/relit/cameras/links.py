@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from relit.cameras.sfm import _quiet
+from relit.cameras.sfm import quiet
 from relit.capture.colmap_model import camera_from_colmap, sparse_points, world_from_camera
 from relit.device import load_pycolmap
 from relit.images import write_data, write_srgb
@@ -52,7 +52,7 @@ def link_photos(
     for name in ("images", "masks", "models"):
         (workdir / name).mkdir(parents=True)
     try:
-        with _quiet(pycolmap):
+        with quiet(pycolmap):
             models = _map(pycolmap, photos, workdir, seed)
             groups = sorted((_group(m, photos) for m in models), key=lambda g: -len(g.photos))
     finally:

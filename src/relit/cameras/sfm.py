@@ -104,7 +104,7 @@ def find_cameras(
     names, scales, small = _write_photos(photos, workdir)
     has_masks = all(m is not None for m in small)
     tries, best, features = [], None, {}
-    with _quiet(pycolmap):
+    with quiet(pycolmap):
         for number, settings in enumerate(_plan(photos, capture, has_masks, focal)):
             say(f"try {number + 1}: {settings.title}")
             found = _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_masks)
@@ -271,7 +271,7 @@ def _matches(database: Path) -> dict[str, int]:
 
 
 @contextmanager
-def _quiet(pycolmap):
+def quiet(pycolmap):
     """COLMAP's log would bury our own lines."""
     log = pycolmap.logging
     before = log.minloglevel, log.stderrthreshold

@@ -72,7 +72,7 @@ def links_of(shots: list[Shot], run, options: DuplicatesOptions, seed: int) -> t
     """Links of pairs by rotation-swept feature matching: (i, j, rotation of i onto j in the photo)."""
     from relit.cameras.duplicates import find_features, link_instances, map_instances
     from relit.cameras.matcher import link_by_matcher, load_matcher
-    from relit.cameras.sfm import _quiet
+    from relit.cameras.sfm import quiet
     from relit.device import load_pycolmap
 
     full = all_views(shots, 10**6, options)
@@ -81,7 +81,7 @@ def links_of(shots: list[Shot], run, options: DuplicatesOptions, seed: int) -> t
     error = max(0.5, float(np.median([max(v.mask.shape) for v in full])) / 250)
     sweep = "rotation_sweep" not in options.without
     windows = [(v.rgb, v.mask, offset) for v, offset in zip(full, offsets, strict=True)]
-    with _quiet(load_pycolmap()):
+    with quiet(load_pycolmap()):
         if options.matcher:
             features, links = link_by_matcher(load_matcher(options.matcher), windows, cameras, error, sweep=sweep)
         else:
