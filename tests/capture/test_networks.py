@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tiny_onnx import write_pointwise
 
-from relit.capture.networks import MEAN, SPREAD, found_instances, load_network, predicted_normals
+from relit.capture.networks import MEAN, SPREAD, Network, found_instances, predicted_normals
 from relit.errors import UserError
 from relit.plan import Job, open_as
 
@@ -48,9 +48,9 @@ def test_without_a_segmenter_it_is_named_in_the_way_out(tmp_path):
 
 
 def test_numbers_of_a_panoptic_segmenter(tmp_path):
-    network = load_network(write_pointwise(tmp_path / "numbers.onnx", np.array([[0.0, 0, 0]]), [3.0]))
+    network = Network(write_pointwise(tmp_path / "numbers.onnx", np.array([[0.0, 0, 0]]), [3.0]))
     assert (found_instances(network, np.zeros((H, W, 3), np.float32)) == 3).all()
-    nothing = load_network(write_pointwise(tmp_path / "nothing.onnx", np.array([[0.0, 0, 0]]), [0.0]))
+    nothing = Network(write_pointwise(tmp_path / "nothing.onnx", np.array([[0.0, 0, 0]]), [0.0]))
     with pytest.raises(UserError, match="finds no object"):
         found_instances(nothing, np.zeros((H, W, 3), np.float32))
 
@@ -59,7 +59,7 @@ def test_numbers_of_a_panoptic_segmenter(tmp_path):
 def test_predicted_normals_are_turned_to_the_cameras_axes(tmp_path, coded):
     up_and_near = np.array([0.0, 0.6, 0.8])
     bias = up_and_near * 0.5 + 0.5 if coded else up_and_near - np.array([1e-3, 0, 0])
-    network = load_network(write_pointwise(tmp_path / "normals.onnx", np.zeros((3, 3)), bias))
+    network = Network(write_pointwise(tmp_path / "normals.onnx", np.zeros((3, 3)), bias))
     labels = np.zeros((H, W), np.int32)
     cv2.circle(labels, (40, 48), 25, 7, -1)
     normal = predicted_normals(network, np.full((H, W, 3), 0.3, np.float32), labels)
@@ -68,10 +68,10 @@ def test_predicted_normals_are_turned_to_the_cameras_axes(tmp_path, coded):
 
 def test_wrong_networks_are_named(tmp_path):
     with pytest.raises(UserError, match="no network at"):
-        load_network(tmp_path / "none.onnx")
+        Network(tmp_path / "none.onnx")
     (tmp_path / "bad.onnx").write_bytes(b"\x08\x08not a network")
     with pytest.raises(UserError, match="cannot be read"):
-        load_network(tmp_path / "bad.onnx")
-    two = load_network(write_pointwise(tmp_path / "two.onnx", np.zeros((2, 3)), [0.0, 1.0]))
+        Network(tmp_path / "bad.onnx")
+    two = Network(write_pointwise(tmp_path / "two.onnx", np.zeros((2, 3)), [0.0, 1.0]))
     with pytest.raises(UserError, match="normals"):
         predicted_normals(two, np.zeros((H, W, 3), np.float32), np.ones((H, W), np.int32))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tiny_onnx import field, tensor
 
 from relit.conventions import srgb_from_linear
 from relit.errors import UserError
@@ -9,26 +10,6 @@ from relit.fit.flash_dino import KEPT, MEAN, SCALE, SPREAD, DinoNetwork, dino_fe
 from relit.scene import Camera
 
 PATCH, CHANNELS = 8, 5
-
-
-def field(number: int, value) -> bytes:
-    """One field of a protocol buffer: int, bytes or str."""
-
-    def varint(v: int) -> bytes:
-        out = bytearray()
-        while v > 0x7F:
-            out.append(v & 0x7F | 0x80)
-            v >>= 7
-        return bytes([*out, v])
-
-    if isinstance(value, int):
-        return varint(number << 3) + varint(value)
-    data = value.encode() if isinstance(value, str) else value
-    return varint(number << 3 | 2) + varint(len(data)) + data
-
-
-def numbers(name: str, array: np.ndarray, kind: int) -> bytes:
-    return b"".join(field(1, int(n)) for n in array.shape) + field(2, kind) + field(8, name) + field(9, array.tobytes())
 
 
 def integers(name: str, values) -> bytes:
@@ -48,7 +29,7 @@ def write_network(path, weight: np.ndarray) -> None:
     """Patches of the picture times `weight` (CHANNELS, 3, PATCH, PATCH), as tokens (1, P, CHANNELS)."""
     graph = node("Conv", ["x", "w"], "c", integers("kernel_shape", [PATCH, PATCH]), integers("strides", [PATCH, PATCH]))
     graph += node("Reshape", ["c", "shape"], "r") + node("Transpose", ["r"], "y", integers("perm", [0, 2, 1])) + field(2, "patches")
-    graph += field(5, numbers("w", weight.astype("<f4"), 1)) + field(5, numbers("shape", np.array([1, CHANNELS, -1], "<i8"), 7))
+    graph += field(5, tensor("w", weight.astype("<f4"))) + field(5, tensor("shape", np.array([1, CHANNELS, -1], "<i8"), 7))
     graph += field(11, value("x", 1, 3, "h", "w")) + field(12, value("y", 1, "p", CHANNELS))
     path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13)))
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from relit.capture.frames import image_folder, list_images, pose_from, read_json
 from relit.capture.labels import BOP_TRUTH, bop_object, checked_labels, read_labels
-from relit.capture.networks import found_instances, load_network
+from relit.capture.networks import Network, found_instances
 from relit.capture.photo import Decoder
 from relit.conventions import world_from_cv_camera
 from relit.errors import UserError
@@ -153,7 +153,7 @@ def open_segmented(path: Path, network: str, *, focal: float | None = None, max_
         raise UserError("no photo was found", fix=f"give a photo or a folder of photos: {path}")
     root = path if path.is_dir() else path.parent
     source, notes, photos = Source(root, files[0], Path(network), _cameras(root)), [], []
-    segmenter = load_network(network)
+    segmenter = Network(network)
     for file in files:
         labels, dropped = checked_labels(found_instances(segmenter, read_image(file).rgb), file)
         notes += [*dropped, f"{file.name}: {len(np.unique(labels[labels > 0]))} objects found by {Path(network).name}; look at them"]

@@ -54,7 +54,7 @@ def links_stage(shots: list[Shot], run, seed: int) -> list[Group]:
             run.say(f"note: photos are not matched with each other: {error}")
             groups = []
         else:
-            groups = link_photos([_full(s) for s in shots], run.folder / "links", seed, run.say)
+            groups = link_photos([_full(s) for s in shots], stage.folder / "work", seed, run.say)
         stage.save("groups", count=np.array(len(groups)), **{f"{n}{i}": getattr(g, n) for i, g in enumerate(groups) for n in names})
     return groups
 

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.cameras.se3 import nearest_rotation, rotation_angle, rotation_from
-from relit.capture.networks import load_network, predicted_normals
+from relit.capture.networks import Network, predicted_normals
 from relit.conventions import move_points, similarity
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions, options_for
@@ -88,7 +88,7 @@ def with_normals(pixels: Pixels, options: DuplicatesOptions) -> Pixels:
     """The photo with normal priors from the network of the options, where there is one and no file holds any."""
     if not options.normal_network or pixels.normal is not None or "normals" in options.without:
         return pixels
-    return replace(pixels, normal=predicted_normals(load_network(options.normal_network), pixels.rgb, pixels.labels))
+    return replace(pixels, normal=predicted_normals(Network(options.normal_network), pixels.rgb, pixels.labels))
 
 
 # ---------------------------------------------------------------- shape

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
 from relit.fit.loop import NoStage
-from relit.fit.pixels import PixelBank, batch_of, draw_pixels
-from relit.fit.surface import SurfaceModel, SurfaceOptions, dual_values, fit_surface, start_surface
+from relit.fit.pixels import PixelBank
+from relit.fit.surface import SurfaceModel, SurfaceOptions, drawn_points, dual_values, fit_surface, start_surface
 from relit.materials.field import material_at
-from relit.rendering.transport import TraceableMesh, first_hits, reflected, sample_lights
+from relit.rendering.transport import TraceableMesh, reflected, sample_lights
 
 SIDES = (0.1, 0.5)  # first metallic of the two fits
 GROUPS = 6  # of like colours
@@ -65,19 +65,13 @@ def errors(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, o: Surface
     rng = mi.PCG32(size=o.points, initstate=seed * 7919 + 29)
     out = np.zeros((groups, 3))
     for _ in range(BATCHES):
-        pixel = draw_pixels(bank, rng, o.points)
-        dr.eval(pixel, rng)
-        batch = batch_of(bank, pixel)
-        points = first_hits(mesh, batch.o, batch.d)
-        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
-        points.valid = valid
-        dr.eval(points, batch.rgb)
-        surface = material_at(model.material, points.uv, valid)
+        batch, points = drawn_points(bank, mesh, rng, o.points)
+        surface = material_at(model.material, points.uv, points.valid)
         dr.eval(surface.base, surface.roughness, surface.metallic)
         lights = sample_lights(mesh, points, surface, model.environment, o.directions, rng)
         a, b = reflected(points, lights, surface, model.environment)
         value = dual_values(a, b, batch.rgb)
-        keep = np.array(valid)
+        keep = np.array(points.valid)
         uv = np.clip((np.array(points.uv).T * size).astype(int), 0, size - 1)[keep]
         group = vq(colour[uv[:, 1], uv[:, 0]], centres)[0]
         for column, values in enumerate((np.array(value)[keep], np.array(surface.metallic)[keep], np.ones(len(group)))):

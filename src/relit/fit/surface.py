@@ -141,13 +141,8 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     def step(i: int) -> dict:
         decay = cosine_decay(i / options.steps, 0.05)
         warm = min(1.0, 0.05 + (i / (options.warm * options.steps)) ** 2)  # the light first: base colour could explain all shading at once
-        pixel = draw_pixels(bank, rng, count)
-        dr.eval(pixel, rng)
-        batch = batch_of(bank, pixel)
-        points = first_hits(mesh, batch.o, batch.d)
-        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
-        points.valid = valid
-        dr.eval(points, batch.rgb)
+        batch, points = drawn_points(bank, mesh, rng, count)
+        valid = points.valid
         near = neighbours(mesh, points, options.similarity_reach, rng)
         close = neighbours(mesh, points, options.slope_reach, rng)
         dr.eval(near, close, rng)
@@ -214,6 +209,17 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
 
     run_steps(stage, first, options.steps, step, state, preview=surface_preview(bank, mesh, textures))
     return model
+
+
+def drawn_points(bank: PixelBank, mesh: TraceableMesh, rng, count: int):
+    """`count` drawn pixels (RayBatch) and the surface they show (Points), valid where a pixel is all object and not seen too flat."""
+    pixel = draw_pixels(bank, rng, count)
+    dr.eval(pixel, rng)
+    batch = batch_of(bank, pixel)
+    points = first_hits(mesh, batch.o, batch.d)
+    points.valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
+    dr.eval(points, batch.rgb)
+    return batch, points
 
 
 def dual_loss(a, b, target, valid):
