@@ -52,6 +52,24 @@ def test_windows_look_at_the_same_pixels_and_know_what_another_object_may_hide()
     assert len(drawn) and not set(drawn.tolist()) & set(hidden.tolist())
 
 
+def test_beyond_the_border_nothing_is_known():
+    labels = np.zeros((120, 200), np.int32)
+    cv2.circle(labels, (100, 110), 30, 1, -1)  # a third of it lies below the photo
+    cv2.circle(labels, (40, 40), 20, 2, -1)
+    rgb = np.random.default_rng(0).uniform(0, 1, (120, 200, 3)).astype(np.float32)
+    cut, whole = views_of(rgb, labels, CAMERA, 10**6)
+    left, top = round(CAMERA.cx - cut.camera.cx), round(CAMERA.cy - cut.camera.cy)
+    inside = 120 - top
+    assert cut.mask.shape[0] > inside and np.array_equal(cut.rgb[:inside], rgb[top:, left : left + cut.mask.shape[1]])
+    assert (cut.known[inside:] == 0).all() and (cut.known[:inside] == 1).all() and (cut.mask[inside:] == 0).all()
+    assert whole.seen == 1 and 0.6 < cut.seen < 0.9
+    pose = first_pose(cut, frame_scale([cut]))
+    wide = replace(cut.camera, fx=1.0, fy=1.0, cx=20.0, cy=20.0)
+    everywhere = replace(cut, mask=np.ones_like(cut.mask), known=np.ones_like(cut.known), camera=wide)
+    down = node_positions(24)[carved([cut, everywhere], np.stack([pose, pose]), 24, 0.0) < 0]
+    assert down[:, 1].max() > 0.9 > -down[:, 1].min()  # the body may go on below the border, but not above its outline
+
+
 def test_a_disc_inflates_to_a_body_as_wide_and_nearly_as_deep():
     labels = np.zeros((120, 200), np.int32)
     cv2.circle(labels, (140, 70), 30, 1, -1)

@@ -7,7 +7,8 @@ import pytest
 
 from relit.cameras.se3 import exp_so3
 from relit.conventions import environment_directions, move_points, similarity
-from relit.fit.pile_scene import SETTLED, ground_reflectance, light_below, set_down
+from relit.fit.pile_scene import SETTLED, distance_in, ground_reflectance, light_below, set_down
+from relit.geometry.sdf import node_positions
 
 UP = np.array([0.0, -np.sin(0.9), -np.cos(0.9)])  # of the ground, in the photo's frame
 
@@ -16,6 +17,10 @@ def ball(count=600):
     rng = np.random.default_rng(0)
     v = rng.normal(size=(count, 3))
     return 0.8 * v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def from_ball(points):
+    return np.linalg.norm(points, axis=-1) - 0.8
 
 
 def standing(vertices, count, seed=1):
@@ -37,7 +42,7 @@ def test_what_floats_or_sinks_is_set_down_along_its_line_of_sight():
     seen = [similarity(m[:3, :3], m[:3, 3] * (1 + e)) for m, e in zip(true, errors, strict=True)]
     wrong = np.array([np.linalg.inv(m) for m in seen])
     tilted = exp_so3(np.array([0.02, 0.0, 0.01])) @ UP
-    poses, plane, count = set_down(vertices, wrong, np.stack([[0, 0, 10.02], tilted]))
+    poses, plane, count = set_down(vertices, wrong, np.stack([[0, 0, 10.02], tilted]), lambda points: np.full(points.shape[:-1], 9.0))
     assert count == 16
     assert np.degrees(np.arccos(plane[1] @ UP)) < 0.6
     before = [np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(seen, true, strict=True)]
@@ -48,11 +53,37 @@ def test_what_floats_or_sinks_is_set_down_along_its_line_of_sight():
     assert np.allclose(poses[:, :3, :3], wrong[:, :3, :3])
 
 
+def test_what_lies_deep_in_the_ground_is_lifted_and_what_floats_over_another_comes_to_rest_on_it():
+    vertices = ball(6000)
+    side, ahead = np.cross(UP, [1.0, 0, 0]), np.array([1.0, 0, 0])
+    at = [np.array([0, 0, 10.0]) + a * 1.9 * ahead + b * 1.9 * side + 0.8 * UP for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    at.append((at[4] + at[5]) / 2 + np.sqrt(1.6**2 - 0.95**2) * UP)  # on two others
+    at.append(at[0] + 1.6 * UP)  # on top of one
+    turn = np.eye(3)
+    true = [similarity(turn, p) for p in at]
+    shift = np.zeros(len(at))
+    shift[3], shift[9], shift[10] = 0.015, -0.012, 0.009
+    seen = np.array([np.linalg.inv(similarity(turn, p * (1 + e))) for p, e in zip(at, shift, strict=True)])
+    poses, _, count = set_down(vertices, seen, np.stack([[0, 0, 10.0], UP]), from_ball)
+    assert count == len(at)
+    for k, p in enumerate(poses):
+        assert np.linalg.norm(np.linalg.inv(p)[:3, 3] - true[k][:3, 3]) < 0.03, k
+
+
+def test_distances_between_nodes_and_beyond_the_cube():
+    p = node_positions(41)
+    distance = distance_in((np.linalg.norm(p, axis=-1) - 0.8).astype(np.float32))
+    points = np.random.default_rng(0).uniform(-0.95, 0.95, (50, 2, 3))
+    assert np.allclose(distance(points), from_ball(points), atol=0.02)
+    assert distance(np.array([[3.0, 0, 0]]))[0] == pytest.approx(2.2, abs=0.01)
+    assert distance(np.array([[0.5, 0.1, -0.2]]))[0] < 0 < distance(np.array([[0.1, 0.2, 0.9]]))[0]
+
+
 def test_few_objects_stay_where_they_are():
     vertices = ball()
     poses = np.array([np.linalg.inv(m) for m in standing(vertices, SETTLED - 1)])
     plane = np.stack([[0, 0, 10.0], UP])
-    same, _, count = set_down(vertices, poses, plane)
+    same, _, count = set_down(vertices, poses, plane, from_ball)
     assert count == 0 and np.array_equal(same, poses)
 
 

@@ -29,7 +29,7 @@ from relit.fit.instance_search import Search
 from relit.fit.instances import ANOTHER_PHOTO, View, carved, move_poses, moved_poses, pixel_bank
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pile_photos import Scene, gather
-from relit.fit.pile_scene import find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
+from relit.fit.pile_scene import distance_in, find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
 from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
@@ -138,9 +138,9 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
         poses = np.linalg.inv(scene.standing)
         plane = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, poses)
         if len(plane) and rate > 0 and len(scene.motions) == 1:
-            poses, plane, count = set_down(mesh.vertices, poses, plane)
+            poses, plane, count = set_down(mesh.vertices, poses, plane, distance_in(dense_values(model.grid)))
             if count:
-                run.say(f"{count} instances stand on the ground and were moved along their lines of sight onto it")
+                run.say(f"{count} instances were moved along their lines of sight onto the ground, or onto what they rest on")
         if len(plane) == 0:
             run.say("note: no ground was found that the instances stand on; nothing but they themselves casts shadows")
         parts = {

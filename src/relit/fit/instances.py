@@ -64,25 +64,22 @@ def views_of(
     rgb: np.ndarray, labels: np.ndarray, camera: Camera, side: int, normal: np.ndarray | None = None, photo: int = 0
 ) -> list[View]:
     """A view of each label > 0, in windows of at most `side` pixels. camera: of the photo, identity pose. normal: of the photo, or None.
-    photo: its number."""
+    photo: its number. What a window holds beyond the photo's border is not known."""
     out = []
     for label in np.unique(labels[labels > 0]):
         own = labels == label
         rows, columns = np.flatnonzero(own.any(1)), np.flatnonzero(own.any(0))
         grow = max(8, round(MARGIN * max(np.ptp(rows), np.ptp(columns))))
-        top, bottom = max(rows[0] - grow, 0), min(rows[-1] + 1 + grow, labels.shape[0])
-        left, right = max(columns[0] - grow, 0), min(columns[-1] + 1 + grow, labels.shape[1])
-        window = (slice(top, bottom), slice(left, right))
-        mask = own[window].astype(np.float32)
-        other = (labels[window] != label) & (labels[window] != 0)
-        known = 1.0 - binary_dilation(other, iterations=1).astype(np.float32) * (1 - mask)
+        top, left = rows[0] - grow, columns[0] - grow
+        h, w = rows[-1] + 1 + grow - top, columns[-1] + 1 + grow - left
+        mine, there = window(labels, top, left, h, w), window(np.ones(labels.shape, bool), top, left, h, w)
+        mask = (mine == label).astype(np.float32)
+        other = (mine != label) & (mine != 0)
+        known = there * (1.0 - binary_dilation(other, iterations=1).astype(np.float32) * (1 - mask))
         edge = binary_dilation(mask > 0, iterations=2) & (mask == 0)
         seen = float(known[edge].mean()) if edge.any() else 0.0
-        if rows[0] == 0 or columns[0] == 0 or rows[-1] == labels.shape[0] - 1 or columns[-1] == labels.shape[1] - 1:
-            seen *= 0.5  # the frame cuts it
-        w, h = right - left, bottom - top
-        c = replace(camera, width=w, height=h, cx=camera.cx - left, cy=camera.cy - top)
-        picture, prior = rgb[window], None if normal is None else normal[window] * mask[..., None]
+        c = replace(camera, width=int(w), height=int(h), cx=camera.cx - left, cy=camera.cy - top)
+        picture, prior = window(rgb, top, left, h, w), None if normal is None else window(normal, top, left, h, w) * mask[..., None]
         s = min(1.0, side / max(w, h))
         if s < 1:
             size = (max(8, round(w * s)), max(8, round(h * s)))
@@ -91,6 +88,13 @@ def views_of(
             c = c.resized(*size)
         out.append(View(int(label), c, picture, mask, (known > 0.99).astype(np.float32), seen, prior, photo))
     return out
+
+
+def window(a: np.ndarray, top: int, left: int, h: int, w: int) -> np.ndarray:
+    """(h, w, ...) of a picture, 0 beyond its border."""
+    rows, columns = np.clip([top, top + h], 0, a.shape[0]), np.clip([left, left + w], 0, a.shape[1])
+    beyond = ((rows[0] - top, top + h - rows[1]), (columns[0] - left, left + w - columns[1]))
+    return np.pad(a[slice(*rows), slice(*columns)], (*beyond, *[(0, 0)] * (a.ndim - 2)))
 
 
 def pixel_bank(views: list[View], poses: np.ndarray) -> PixelBank:
@@ -167,7 +171,7 @@ def carved(
         u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
         ok = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height) & (q[:, 2] > 0)
         u, v = np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1)
-        known = np.where(ok, view.known[v, u], 1.0) > 0.5
+        known = view.known[v, u] > 0.5  # beyond the window: as at its edge
         out = ~(ok & (view.mask[v, u] > 0.3))
         if depth is not None and not bounded:
             middle = float(np.linalg.norm(camera.centre))
@@ -204,10 +208,10 @@ def fit_model(
 
 
 def move_poses(bank: PixelBank, model: VolumeModel) -> None:
-    """Let the volume pass turn the cameras about the object's middle (not about themselves, which would throw the picture aside), and move
-    them; the focal length stays."""
-    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
-    model.extra["correction_rates"] = mi.Float(np.tile(np.array([1, 1, 1, 1, 1, 1, 0], np.float32), bank.views))
+    """Let the volume pass turn the cameras about the object's middle (not about themselves, which would throw the picture aside), move
+    them, and change their distance; the focal length stays."""
+    bank.corrections = dr.zeros(mi.Float, 8 * bank.views)
+    model.extra["correction_rates"] = mi.Float(np.tile(np.array([1, 1, 1, 1, 1, 1, 0, 1], np.float32), bank.views))
 
 
 def moved_poses(bank: PixelBank, views: list[View], poses: np.ndarray) -> np.ndarray:

@@ -5,9 +5,11 @@ The scene frame has the world's axes, the object's unit of length, and its origi
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import map_coordinates, minimum_filter
 
 from relit.conventions import environment_directions, environment_solid_angles, move_points
 from relit.fit.pixels import make_bank
@@ -18,7 +20,10 @@ TOUCHES = 0.08  # unit lengths within which an instance counts as touching the g
 SETTLED = 4  # instances that must touch the ground before their distances follow it
 FARTHEST = 0.02  # of its distance that an instance is moved at most
 TILT = 5.0  # degrees that the ground may turn meanwhile
+STEEP = 0.3  # sine of the angle at which the photo must look down on the ground for objects to be moved onto something
 GROUND_ROWS = 96
+
+Distance = Callable[[np.ndarray], np.ndarray]  # of points (..., 3) in the object's frame from its surface, negative inside
 
 
 def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -46,14 +51,16 @@ def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return found
 
 
-def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Poses (N, 4, 4) and the plane after what stands on the ground was moved along its line of sight until it touches, and how many were.
+def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray, distance: Distance) -> tuple[np.ndarray, np.ndarray, int]:
+    """Poses (N, 4, 4) and the plane after every instance was moved along its line of sight until it rests on the ground or on another, and
+    how many were. distance: of points in the object's frame from its surface, negative inside.
 
     The distance of an object is known by its size alone, and half a per cent of the distance is a tenth of an object; the plane under many
-    of them is known far better. It goes through the middle of the lowest points of those that stand on it. Fewer than SETTLED leave
-    everything as it is: any three objects touch some plane.
+    of them is known far better, and nothing hangs in the air or lies below the ground. The plane goes through the middle of the lowest
+    points of those that stand on it. Fewer than SETTLED leave everything as it is: any three objects touch some plane.
     """
-    lowest = [move_points(np.linalg.inv(p), vertices[:: max(1, len(vertices) // 4000)]) for p in poses]
+    points = vertices[:: max(1, len(vertices) // 4000)]
+    lowest = [move_points(np.linalg.inv(p), points) for p in poses]
     point, up = plane
     for _ in range(6):
         feet = np.array([s[np.argmin(s @ up)] for s in lowest])
@@ -65,18 +72,53 @@ def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray) -> tupl
         normal = np.linalg.svd(feet[near] - point)[2][2]
         normal = normal if normal @ up > 0 else -normal
         up = normal if normal @ plane[1] > np.cos(np.radians(TILT)) else plane[1]
-    feet = np.array([s[np.argmin(s @ up)] for s in lowest])
-    gaps = (feet - point) @ up
-    moved, count = np.array(poses), 0
-    for k, gap in enumerate(gaps):
-        ray = np.linalg.inv(poses[k])[:3, 3]
-        share = gap / -(ray @ up)  # of the distance: the object's middle moves by share * ray
-        if abs(gap) < TOUCHES and ray @ up < 0 and abs(share) < FARTHEST:
-            standing = np.linalg.inv(poses[k])
-            standing[:3, 3] += share * ray
-            moved[k] = np.linalg.inv(standing)
-            count += 1
-    return moved, np.stack([point, up]), count
+    gaps = np.array([((s - point) @ up).min() for s in lowest])
+    standing, placed, count = np.linalg.inv(poses), [], 0
+    for k in np.argsort(gaps):
+        ray = standing[k][:3, 3]
+        if -(ray @ up) > STEEP * np.linalg.norm(ray):
+            share = gaps[k] / -(ray @ up)  # of the distance: the object's middle moves by share * ray
+            if gaps[k] > TOUCHES:
+                share = resting_share(points, standing, k, placed, distance, share)
+            if abs(share) < FARTHEST:
+                standing[k][:3, 3] += share * ray
+                count += 1
+        placed.append(k)
+    return np.linalg.inv(standing), np.stack([point, up]), count
+
+
+def resting_share(points: np.ndarray, standing: np.ndarray, k: int, placed: list[int], distance: Distance, ground: float) -> float:
+    """The share of its distance by which instance k moves until it lies on one of those that are placed, or on the ground (which takes the
+    share `ground`); the one next to where it is now. standing: (N, 4, 4) photo_from_object."""
+    shares = np.linspace(-FARTHEST, FARTHEST, 81)
+    room = ground - shares  # negative once it is too far away
+    own = move_points(standing[k], points[::3])
+    ray = standing[k][:3, 3]
+    back = np.linalg.inv(standing[k])
+    for j in placed:
+        if np.linalg.norm(standing[j][:3, 3] - ray) > 2 + FARTHEST * np.linalg.norm(ray):
+            continue
+        there = np.linalg.inv(standing[j])
+        mine = move_points(there, own) + shares[:, None, None] * (there[:3, :3] @ ray)
+        theirs = move_points(back @ standing[j], points[::3]) - shares[:, None, None] * (back[:3, :3] @ ray)
+        room = np.minimum(room, np.minimum(distance(mine).min(1), distance(theirs).min(1)))
+    rests = np.flatnonzero((room[:-1] > 0) & (room[1:] <= 0))
+    if len(rests) == 0:
+        return np.inf
+    found = shares[rests] + (shares[1] - shares[0]) * room[rests] / (room[rests] - room[rests + 1])
+    return float(found[np.argmin(np.abs(found))])
+
+
+def distance_in(values: np.ndarray) -> Distance:
+    """Signed distance of points (..., 3) of the unit frame from the nodes' (n, n, n), trilinear; beyond the cube what it takes to get there
+    comes on top."""
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        inside = np.clip(points, -1, 1)
+        at = (inside[..., ::-1] + 1) * (0.5 * (values.shape[0] - 1))
+        return map_coordinates(values, np.moveaxis(at, -1, 0), order=1, mode="nearest") + np.linalg.norm(points - inside, axis=-1)
+
+    return distance
 
 
 def scene_mesh(mesh: Mesh, parts, standing, scene_from_photo, pixels, camera: Camera, *, alone: bool) -> tuple[Mesh, np.ndarray]:

@@ -22,7 +22,7 @@ class PixelBank:
     """views, total: counts of photos and pixels. rgbm: Float [total * 4], linear RGB and mask. normals: Float [total * 4] or None
     (camera axes, last entry 1 where known). cameras: Float [views * 16]. offsets, widths: UInt32 [views]. candidates: UInt32, the
     pixels that batches are drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector, translation) or
-    [views * 7] (see `rays_through`)."""
+    [views * 7] or [views * 8] (see `rays_through`)."""
 
     views: int
     total: int
@@ -112,13 +112,15 @@ def rays_through(cameras, view, x, y, corrections=None):
     A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by the translation, both in the unit frame.
     Where corrections have seven numbers a view, the camera turns about the ORIGIN of the unit frame (a viewpoint that is wrong is put right
     without moving the picture), then moves, and the seventh is 1 / ZOOM of the logarithm of a factor on the focal lengths and on the
-    distance from the origin together (what stands there keeps its size in the picture; only the perspective changes).
+    distance from the origin together (what stands there keeps its size in the picture; only the perspective changes). An eighth is the
+    logarithm of a factor on the distance alone: among the translations, which are in the axes of the unit frame, it would be lost beside
+    what moves the picture aside.
     """
     k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
     each = 6 if corrections is None else dr.width(corrections) * CAMERA_FLOATS // dr.width(cameras)
-    if each == 7:
-        zoom = dr.exp(-ZOOM * dr.gather(mi.Float, corrections, view * 7 + 6))
+    if each > 6:
+        zoom = dr.exp(-ZOOM * dr.gather(mi.Float, corrections, view * each + 6))
         lx, ly = lx * zoom, ly * zoom
     d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
     o = mi.Vector3f(k[1].w, k[2].w, k[3].w)
@@ -131,20 +133,25 @@ def rays_through(cameras, view, x, y, corrections=None):
             turned = dr.cross(w, v)
             return v + (1 - theta2 / 6 * (1 - theta2 / 20)) * turned + (0.5 - theta2 / 24 * (1 - theta2 / 30)) * dr.cross(w, turned)
 
-        d, o = turn(d), (turn(o) / zoom if each == 7 else o) + mi.Vector3f(c[3], c[4], c[5])
+        d, o = turn(d), turn(o) / zoom if each > 6 else o
+        if each > 7:
+            o = o * dr.exp(dr.gather(mi.Float, corrections, view * each + 7))
+        o = o + mi.Vector3f(c[3], c[4], c[5])
     return o, d
 
 
 def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
-    """The cameras with their corrections, (views * 6) or (views * 7), built in."""
+    """The cameras with their corrections, (views * 6), (views * 7) or (views * 8), built in."""
     out = []
     for camera, c in zip(cameras, np.asarray(corrections, np.float64).reshape(len(cameras), -1), strict=True):
         pose = np.array(camera.world_from_camera, np.float64)
         turn, zoom = exp_so3(c[:3]), 1.0
         pose[:3, :3] = turn @ pose[:3, :3]
-        if len(c) == 7:
+        if len(c) > 6:
             zoom = float(np.exp(ZOOM * c[6]))
             pose[:3, 3] = zoom * (turn @ pose[:3, 3])
+        if len(c) > 7:
+            pose[:3, 3] *= np.exp(c[7])
         pose[:3, 3] += c[3:6]
         out.append(replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom, world_from_camera=pose))
     return out
