@@ -11,10 +11,11 @@ import pytest
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_growth import Growth, grow, linked_poses
+from relit.fit.instance_lookup import look_for
 from relit.fit.instance_search import Guesses, Search, crops_of, first_pairs, place, reconsider, trusted
-from relit.fit.instances import carved, first_pose, fit_model, frame_scale, inflated, pixel_bank, views_of
+from relit.fit.instances import albedo_render, carved, first_pose, fit_model, frame_scale, inflated, pixel_bank, views_of
 from relit.fit.pile_scene import find_ground
-from relit.fit.register import crop_rings
+from relit.fit.register import crop_rings, directions_around, make_gallery, search, views_from
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
@@ -199,6 +200,28 @@ def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
     assert np.array_equal(found[[0, 2, 3]], truth[[0, 2, 3]])
     again = reconsider(views, crops, crop_rings(crops, parts), found.copy(), np.array([0.9, 0.6, 0.9, 0.9]), o, seed=0, parts=parts)
     assert again[2] == 0  # what stands rightly stays
+
+
+def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead():
+    views, truth = painted([0, 20, 40, 60])
+    parts = (0.6, 2.0, 0.1)
+    v = views[1]
+    hidden = np.arange(v.mask.shape[1]) > 0.5 * v.mask.shape[1]
+    known = np.where(hidden, 0, v.known).astype(np.float32)
+    cut = replace(v, mask=np.where(hidden, 0, v.mask).astype(np.float32), known=known, seen=0.5)
+    some = [views[k] for k in (0, 2, 3)]
+    model, _ = fit_model(some, truth[[0, 2, 3]], carved(some, truth[[0, 2, 3]], 24, 0.2), 12)
+    directions = directions_around(500)
+    close = (directions @ (truth[:, :3, 3] / 5).T).max(1) > np.cos(np.radians(30))
+    gallery = make_gallery(albedo_render(model), views_from(directions[close], 5.0), parts)
+    crops = crops_of([cut])
+    rings = crop_rings(crops, parts)
+    found = look_for([cut], crops, gallery, rings, parts, keep=2)
+    assert rotation_angle(found.poses[0, 0][:3, :3].T @ truth[1][:3, :3]) < 15
+    assert found.scores[0, 0] > search(crops, gallery, keep=1, rings=rings).scores[0, 0] + 0.02
+    assert rotation_angle(found.poses[0, 0][:3, :3].T @ found.poses[0, 1][:3, :3]) >= 20
+    whole = look_for(views[:1], crops_of(views[:1]), gallery, crop_rings(crops_of(views[:1]), parts), parts)
+    assert np.array_equal(whole.poses, search(crops_of(views[:1]), gallery, rings=crop_rings(crops_of(views[:1]), parts)).poses)
 
 
 def test_instances_with_low_scores_are_not_trusted():

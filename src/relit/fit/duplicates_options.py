@@ -46,6 +46,7 @@ class DuplicatesOptions:
 WITHOUT = {
     "rotation_sweep": "pictures are matched as they are, not turned against each other",
     "matching": "no features are matched",
+    "guided": "matches are not sought again once poses are known",
     "search": "what matching does not link is dropped",
     "refinement": "poses stay as search has found them",
     "visibility": "no instance, and no ground, shadows another",

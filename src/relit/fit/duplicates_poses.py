@@ -5,8 +5,11 @@ Instances of several photos of one pile are views of the same object like those 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instance_search import Search, place
@@ -36,10 +39,10 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
         return saved["poses"], saved["registered"], saved["labels"]
     views = all_views(shots, COARSE, options)
     with run.stage("poses", title="poses of the instances") as stage:
-        links = () if "matching" in options.without else links_of(shots, run, options, seed)
+        matched = None if "matching" in options.without else match_instances(shots, run, options, seed)
         search = Search(rounds=options.search_rounds, **({"descents": 0} if "refinement" in options.without else {}))
         try:
-            poses, scores = place(views, search, seed=seed, links=links, say=run.say)
+            poses, scores = place(views, search, seed=seed, links=matched.told if matched else (), say=run.say)
         except ValueError:
             raise UserError(
                 "no poses of the instances fit together",
@@ -48,7 +51,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
                 code=EXIT_FAILED,
             ) from None
         registered = scores >= np.median(scores) - AGREES
-        linked = {i for link in links for i in link[:2]}
+        linked = {i for link in (matched.told if matched else ()) for i in link[:2]}
         if "search" in options.without and len(views) > 1:
             registered &= np.array([k in linked for k in range(len(views))])
         if registered.sum() < min(2, len(views)):
@@ -57,6 +60,8 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
             run.say(f"note: the object with {named(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only")
         if len(views) > 1 and scores[registered].std() < 0.002 and scores.min() > 0.985:
             run.say("note: all poses fit equally well: a symmetric or textureless object leaves them ambiguous")
+        if matched and not {"guided", "refinement"} & set(options.without):
+            poses = adjusted_poses(matched, poses, registered, run)
         poses = centred(views, poses, registered)
         keys = np.array([v.key for v in views])
         stage.save("poses", poses=poses, registered=registered, labels=keys, scores=scores)
@@ -68,8 +73,20 @@ def named(view: View) -> str:
     return f"label {view.label}" + (f" in photo {view.photo + 1}" if view.photo else "")
 
 
-def links_of(shots: list[Shot], run, options: DuplicatesOptions, seed: int) -> tuple:
-    """Links of pairs by rotation-swept feature matching: (i, j, rotation of i onto j in the photo)."""
+@dataclass(frozen=True)
+class Matched:
+    """What matching says. features: of each instance. links: matches of pairs. told: (i, j, rotation of i onto j in the photo) of pairs.
+    cameras: of each instance, the whole photo's. error: pixels within which matches agree."""
+
+    features: list
+    links: dict
+    told: tuple
+    cameras: list[Camera]
+    error: float
+
+
+def match_instances(shots: list[Shot], run, options: DuplicatesOptions, seed: int) -> Matched:
+    """Links of pairs by rotation-swept feature matching."""
     from relit.cameras.duplicates import find_features, link_instances, map_instances
     from relit.cameras.matcher import link_by_matcher, load_matcher
     from relit.cameras.sfm import quiet
@@ -98,7 +115,29 @@ def links_of(shots: list[Shot], run, options: DuplicatesOptions, seed: int) -> t
         together |= {(i, j) for i in members for j in members if i < j}
         out += [(i, j, cluster[j][:3, :3] @ cluster[i][:3, :3].T) for i in members for j in members if i < j]
     out += [(i, j, link.rotation) for (i, j), link in links.items() if link.rotation is not None and (i, j) not in together]
-    return tuple(out)
+    return Matched(features, links, tuple(out), cameras, error)
+
+
+def adjusted_poses(matched: Matched, poses: np.ndarray, registered: np.ndarray, run) -> np.ndarray:
+    """The poses after matches were sought again, guided by them, and adjusted over these (SfD Sec. 3.1, after the search)."""
+    from relit.cameras.guided import guided
+    from relit.cameras.sfm import quiet
+    from relit.device import load_pycolmap
+
+    chosen = np.flatnonzero(registered).tolist()
+    number = {k: n for n, k in enumerate(chosen)}
+    links = {(number[i], number[j]): link for (i, j), link in matched.links.items() if i in number and j in number}
+    out = poses.copy()
+    with quiet(load_pycolmap()):
+        out[chosen], count = guided(
+            [matched.features[k] for k in chosen], links, poses[chosen], [matched.cameras[k] for k in chosen], matched.error
+        )
+    if count:
+        turns = [rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(out[chosen], poses[chosen], strict=True)]
+        run.say(
+            f"matches guided by the poses link {count} pairs; bundle adjustment turns the instances by {np.median(turns):.1f} degrees"
+        )
+    return out
 
 
 def centred(views: list[View], poses: np.ndarray, registered: np.ndarray) -> np.ndarray:

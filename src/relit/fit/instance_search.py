@@ -13,6 +13,7 @@ import numpy as np
 
 from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_growth import Growth, chosen_rings, grow, seen_from
+from relit.fit.instance_lookup import look_for
 from relit.fit.instances import View, albedo_render, carved, first_pose, fit_model, frame_scale, inflated
 from relit.fit.register import (
     Crop,
@@ -23,7 +24,6 @@ from relit.fit.register import (
     make_gallery,
     refine,
     rings_of,
-    search,
     views_from,
 )
 
@@ -31,6 +31,7 @@ from relit.fit.register import (
 # of it
 PARTS, COLOURFUL = (0.5, 2.0, 0.6), (0.6, 2.0, 0.1)
 
+APART = 25.0  # degrees from which on a pose is another one
 GAP = 0.1  # an instance's score may lie so much below those of the best third
 
 
@@ -97,7 +98,7 @@ def pair_guesses(views: list[View], crops, chosen: list[int], o: Search, distanc
         rgb, alpha = albedo_render(model)(cameras)
         for parts, guesses in out.items():
             gallery = Gallery(cameras, rings_of(rgb, alpha, parts=parts))
-            found = search(crops, gallery, keep=o.keep, rings=rings[parts], apart=25.0)
+            found = look_for(views, crops, gallery, rings[parts], parts, keep=o.keep, apart=25.0)
             guesses.poses[s], guesses.scores[s] = found.poses, found.scores
             guesses.poses[s, k], guesses.scores[s, k] = pose, -1.0
         say(s + 1, len(chosen))
@@ -136,7 +137,7 @@ def settle(views, crops, rings, poses, scores, o: Search, rounds: int, *, seed: 
         moved = np.zeros(len(views), bool)
         far = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
         gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed + turn), far), parts)
-        found = search(crops, gallery, keep=3, rings=rings)
+        found = look_for(views, crops, gallery, rings, parts, keep=3)
         for k in range(3):
             other, also = refine(crops, found.poses[:, k], render, rings=rings, steps=(0, 4.0, 2.0), parts=parts)
             better = also > scores + 0.004
@@ -187,7 +188,7 @@ def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, part
         gallery = make_gallery(
             render, views_from(directions_around(o.viewpoints, seed + turn), float(np.linalg.norm(poses[k][:3, 3]))), parts
         )
-        found = search([crops[k]], gallery, keep=4, rings=own)
+        found = look_for([views[k]], [crops[k]], gallery, own, parts)
         for n in range(4):
             other, also = refine([crops[k]], found.poses[:, n], render, rings=own, steps=(0, 5.0, 2.5), parts=parts)
             if also[0] > score[0]:
@@ -196,6 +197,25 @@ def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, part
             say(f"{views[k].label} agrees better elsewhere with the model of the others: {before:.3f} -> {score[0]:.3f}")
             poses[k], moved = best[0], moved + 1
     return poses, scores, moved
+
+
+def elsewhere(views, crops, rings, poses, o: Search, *, seed: int, parts=PARTS):
+    """How well each instance agrees with the model of all where it stands, (N,), how well at best at least APART degrees from there, (N,),
+    and how many degrees that is, (N,). Where the second is about as high as the first the picture does not tell the pose."""
+    values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
+    model, _ = fit_model(views, poses, values, 2 * o.steps, seed=seed)
+    render = albedo_render(model)
+    _, own = refine(crops, poses, render, rings=rings, steps=(0, 2.0), parts=parts)
+    far = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
+    gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed), far), parts)
+    found = look_for(views, crops, gallery, rings, parts, keep=3, apart=APART)
+    best, angle = np.full(len(views), -1.0), np.zeros(len(views))
+    for n in range(3):
+        other, score = refine(crops, found.poses[:, n], render, rings=rings, steps=(0, 4.0, 2.0), parts=parts)
+        away = np.array([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(other, poses, strict=True)])
+        better = (away >= APART) & (score > best)
+        best, angle = np.where(better, score, best), np.where(better, away, angle)
+    return own, best, angle
 
 
 def trusted(scores: np.ndarray, gap: float = GAP) -> np.ndarray:
