@@ -1,4 +1,4 @@
-"""A ball of rough plastic under a flash, by the project's own direct light: photos, mesh and textures for the tests of the surface pass."""
+"""A ball and a bowl of rough plastic under a flash: photos, mesh and textures for the tests of the surface pass."""
 
 import drjit as dr
 import mitsuba as mi
@@ -27,6 +27,18 @@ def ball(rows: int = 40, columns: int = 80, radius: float = 0.7) -> Mesh:
     faces = faces[area > 1e-9].astype(np.int32)
     uvs = np.stack([u, v], -1).reshape(-1, 2)
     return Mesh((radius * n).astype(np.float32), faces, n.astype(np.float32), uvs.astype(np.float32))
+
+
+def bowl(rows: int = 24, columns: int = 64) -> Mesh:
+    """The inside of the lower half of a ball."""
+    v, u = np.meshgrid(np.linspace(0.5, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
+    theta, phi = np.pi * v, 2 * np.pi * u
+    n = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], -1).reshape(-1, 3)
+    a = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    faces = np.concatenate([np.stack([a, a + columns + 2, a + columns + 1], 1), np.stack([a, a + 1, a + columns + 2], 1)])
+    area = np.linalg.norm(np.cross(n[faces[:, 1]] - n[faces[:, 0]], n[faces[:, 2]] - n[faces[:, 0]]), axis=1)
+    uvs = np.stack([u, v], -1).reshape(-1, 2)
+    return Mesh((0.8 * n).astype(np.float32), faces[area > 1e-9].astype(np.int32), (-n).astype(np.float32), uvs.astype(np.float32))
 
 
 def textures(size: int = 64):

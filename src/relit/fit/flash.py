@@ -20,6 +20,7 @@ import numpy as np
 
 from relit.conventions import move_points, similarity
 from relit.errors import UserError, did_you_mean
+from relit.fit.flash_ambient import find_ambient
 from relit.fit.flash_dino import DinoNetwork, network_file
 from relit.fit.flash_features import FlashView, capture_features, network_features
 from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
@@ -43,6 +44,7 @@ from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
 LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
+COARSE_FACES = 20_000  # of the mesh on which the volume pass's inter-reflection is estimated
 PLACE = 0.15  # how much a unit length counts beside a display value when places are compared
 START_ALBEDO, MEAN_COSINE, START_WIDTH = 0.4, 0.7, 0.2
 
@@ -220,10 +222,21 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
             coarse = visual_hull(cameras, masks, o.nodes)
             values = without(values, open_hollows(bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed))
         model = start(values, False)
-        fit_volume(bank, model, VolumeOptions(options.levels, options.level_steps, options.rays), stage, seed)
+        mirrors = options.directions > 0 and "interreflection" not in options.without
+        begin_level = (lambda m: look_around(bank, cameras, m, coat)) if mirrors else None
+        fit_volume(bank, model, VolumeOptions(options.levels, options.level_steps, options.rays), stage, seed, begin_level)
+        model.appearance.around = None  # it holds the training photos; the score of others goes without
         offset = np.array(model.reflections)[:3]
         run.say(f"flash after the volume pass: offset {offset.round(4).tolist()} of the object sphere's radius")
     return model
+
+
+def look_around(bank: PixelBank, cameras: list[Camera], model: VolumeModel, coat: Coat) -> None:
+    """Tell the model's appearance what light its surface, as it is now, throws on itself."""
+    values = dense_values(model.grid)
+    flash = FlashView(np.array(model.reflections)[:3], float(model.appearance.intensity[0]))
+    ambient = find_ambient(bank, cameras, extract_mesh(values, faces=COARSE_FACES), coat, flash, BRIGHTEST)
+    model.appearance.around = ambient.around(values, coat)
 
 
 def mesh_stage(model: VolumeModel, run, options: FlashOptions) -> dict[str, np.ndarray]:
@@ -262,7 +275,8 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, satur
             "x": interpolate(mesh.vertices, mesh.faces, face, bary)[known],
             "n": interpolate(mesh.normals, mesh.faces, face, bary)[known],
         }
-        found = capture_features(bank, cameras, traceable, texels["x"], texels["n"], coat, flash)
+        ambient = None if o.directions == 0 else find_ambient(bank, cameras, mesh, coat, flash, BRIGHTEST)
+        found = capture_features(bank, cameras, traceable, texels["x"], texels["n"], coat, flash, ambient)
         diffuse = spread(parts["albedo"][:, :3])
         diffuse[known] = np.where(found.seen[:, None], found.albedo, diffuse[known])
         scale = BRIGHTEST / max(float(np.percentile(diffuse[known].max(1), 99)), 1e-6)

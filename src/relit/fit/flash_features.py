@@ -46,17 +46,27 @@ class Found:
 
 
 def capture_features(
-    bank: PixelBank, cameras: list[Camera], mesh: TraceableMesh, x: np.ndarray, n: np.ndarray, coat: Coat, flash: FlashView
+    bank: PixelBank,
+    cameras: list[Camera],
+    mesh: TraceableMesh,
+    x: np.ndarray,
+    n: np.ndarray,
+    coat: Coat,
+    flash: FlashView,
+    ambient: Any = None,
 ) -> Found:
-    """The features of N surface points x with normals n, both (N, 3), unit frame."""
+    """The features of N surface points x with normals n, both (N, 3), unit frame. ambient: fit.flash_ambient.Ambient, light from the
+    surface itself, none where None."""
     values = np.full((bank.views, len(x), 3), np.nan, np.float16)
     aside = np.zeros((bank.views, len(x)), bool)
     n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
     dr.eval(point, normal)
+    near = None if ambient is None else ambient.near(x, n)
     with dr.suspend_grad():
         for view, camera in enumerate(cameras):
-            values[view], cosine = shading_free(bank, camera, view, mesh, point, normal, coat, flash)
+            around = 0.0 if near is None else (ambient.light[view][near[0]] * near[1][..., None]).sum(1)
+            values[view], cosine = shading_free(bank, camera, view, mesh, point, normal, coat, flash, around)
             aside[view] = np.isfinite(values[view, :, 0]) & (cosine < SIDE)
     seen, enough = np.isfinite(values[..., 0]).sum(0) >= 3, aside.sum(0) >= 4
     albedo = np.full((len(x), 3), 0.5, np.float32)
@@ -83,8 +93,8 @@ class Seen:
     inverse: Any
 
 
-def seen_from(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, flash: FlashView) -> Seen:
-    """x, n: Vector3f, unit frame."""
+def seen_from(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, flash: FlashView, lit_only: bool = False) -> Seen:
+    """x, n: Vector3f, unit frame. lit_only: whether `ok` asks for the flash alone."""
     number = dr.opaque(mi.UInt32, view)
     eye = light_position(bank.cameras, number, mi.Vector3f(0))
     light = light_position(bank.cameras, number, mi.Vector3f(*[float(v) for v in flash.offset]))
@@ -97,28 +107,31 @@ def seen_from(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x
     column = k[0].x * dr.dot(r[0], d) / z + k[0].z
     row = k[0].y * dr.dot(r[1], d) / z + k[0].w
     cos_v, cos_l = dr.dot(n, v), dr.dot(n, l)
-    ok = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (cos_v > 0) & (cos_l > 0)
+    ok = cos_l > 0
+    if not lit_only:
+        ok &= (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (cos_v > 0)
     start = mi.Point3f(x + n * (2 * OFFSET))
-    for end in (eye, light):
+    for end in (light,) if lit_only else (eye, light):
         to = end - mi.Vector3f(start)
         length = dr.norm(to)
         ok &= ~mesh.scene.ray_test(mi.Ray3f(start, to / length, length, 0.0, []), coherent=False, active=ok)
     return Seen(ok, column, row, cos_v, cos_l, inverse)
 
 
-def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, coat: Coat, flash: FlashView):
+def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x, n, coat: Coat, flash: FlashView, around=0.0):
     """The photo's value at the points over what a white diffuse base would show there, (N, 3), NaN where the photo does not show them;
-    and the cosine of the viewer's direction (N,)."""
+    and the cosine of the viewer's direction (N,). around: (N, 3) irradiance from the surface itself over the flash's intensity, or 0."""
     seen = seen_from(bank, camera, view, mesh, x, n, flash)
     ok, cos_v, cos_l = seen.ok & (seen.cos_v > LEAST_COSINE) & (seen.cos_l > LEAST_COSINE), seen.cos_v, seen.cos_l
     pixel = mi.UInt32(dr.clip(seen.row, 0, camera.height - 1)) * camera.width + mi.UInt32(dr.clip(seen.column, 0, camera.width - 1))
     p = dr.gather(mi.Vector4f, bank.rgbm, pixel + dr.gather(mi.UInt32, bank.offsets, dr.opaque(mi.UInt32, view)), ok)
     ok &= p.w > 0.99
     alpha = mi.Float(ALPHA)
-    base = (
-        coat.transmittance(cos_v, alpha) * coat.transmittance(cos_l, alpha) / (1 - coat.internal(alpha)) * cos_l * (dr.inv_pi / coat.ior**2)
-    )
-    out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * seen.inverse * flash.intensity, 1e-6)
+    enters = mi.Color3f(coat.transmittance(cos_l, alpha) * cos_l * seen.inverse)
+    if np.ndim(around):
+        enters += mi.Color3f(np.ascontiguousarray(around.T, np.float32)) * coat.mean_transmittance(ALPHA)
+    base = coat.transmittance(cos_v, alpha) / (1 - coat.internal(alpha)) * (dr.inv_pi / coat.ior**2) * enters
+    out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * flash.intensity, 1e-6)
     out = dr.select(ok, out, dr.nan)
     return np.array(out).T, np.array(cos_v)
 

@@ -114,8 +114,16 @@ def _fill_unknown(features: np.ndarray, known: np.ndarray) -> np.ndarray:
     return features[tuple(nearest)]
 
 
-def fit_volume(bank: PixelBank, model: VolumeModel, options: VolumeOptions, stage, seed: int = 0) -> VolumeModel:
-    """Run all levels; returns the same model, optimised. Resumes from the stage's checkpoint when there is one."""
+def fit_volume(
+    bank: PixelBank,
+    model: VolumeModel,
+    options: VolumeOptions,
+    stage,
+    seed: int = 0,
+    begin_level: Callable[[VolumeModel], None] | None = None,
+) -> VolumeModel:
+    """Run all levels; returns the same model, optimised. Resumes from the stage's checkpoint when there is one. begin_level: called with
+    the model before every level but the first, and where a level is taken up again."""
     done = 0
     saved = stage.load("checkpoint")
     start = int(saved["step"]) if saved else 0
@@ -130,6 +138,8 @@ def fit_volume(bank: PixelBank, model: VolumeModel, options: VolumeOptions, stag
             next_level(model, n, options.band)
         if start >= done + steps:
             break
+        if begin_level is not None and number > 0:
+            begin_level(model)
         _fit_level(bank, model, options, stage, camera_adam, first=max(start, done), begin=done, end=done + steps, seed=seed)
         done += steps
     stage.save("checkpoint", step=done, **_state(model, bank))  # a stop during the mesh stage need not come back here

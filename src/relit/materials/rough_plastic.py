@@ -119,6 +119,11 @@ class Coat:
         g = lambda k: dr.gather(mi.Float, self.transmittances, i + k)  # noqa: E731
         return dr.lerp(dr.lerp(g(0), g(1), fx), dr.lerp(g(COSINES), g(COSINES + 1), fx), fy)
 
+    def mean_transmittance(self, alpha: float) -> float:
+        """Share of diffuse light from outside that enters: 2 ∫ T(θ) cos θ d(cos θ)."""
+        mu = mi.Float(((np.arange(COSINES) + 0.5) / COSINES).astype(np.float32))
+        return float(2 * dr.mean(self.transmittance(mu, mi.Float(alpha)) * mu)[0])
+
     def internal(self, alpha):
         """R_int(alpha), linear; differentiable."""
         row, fy = self._row(alpha)

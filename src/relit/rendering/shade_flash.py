@@ -5,10 +5,13 @@ up to the common factor that they share with the flash's intensity, which is fix
 offset Δo (3 entries) and the lobe's width alpha on a coarse grid over the unit cube, looked up once a ray.
 
 Shadows are soft visibility (Eq. 5): the field's transmittance along the ray from the surface point to the light, with gradients to the
-field and to the light's place. Inter-reflection is left to the surface pass.
+field and to the light's place. Inter-reflection is what `Around` tells, a constant of the pass; the exact term is the surface pass's.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,6 +27,25 @@ OFFSET_RATE, ALPHA_RATE = 0.05, 0.08  # of the pass's rate of what is learnt bes
 LEAVE = 3.0  # voxels along the normal before the shadow ray begins
 
 
+@dataclass(frozen=True)
+class Around:
+    """Irradiance from the surface itself over the flash's intensity. light: Float [views * places * 3]. place: UInt32 [nodes^3], which
+    place a node of a grid over the unit cube takes its light from. nodes: a side. places: their number. enters: share of it that enters
+    the coat."""
+
+    light: Any
+    place: Any
+    nodes: int
+    places: int
+    enters: float
+
+    def at(self, view, x):
+        """Color3f at unit-frame points."""
+        q = [mi.UInt32(dr.clip((c * 0.5 + 0.5) * (self.nodes - 1) + 0.5, 0, self.nodes - 1)) for c in (x.x, x.y, x.z)]
+        place = dr.gather(mi.UInt32, self.place, (q[2] * self.nodes + q[1]) * self.nodes + q[0])
+        return dr.gather(mi.Color3f, self.light, view * self.places + place)
+
+
 class FlashAppearance:
     """The function itself, with what it needs: see `fit.volume.VolumeModel.appearance`. intensity: radiant, grey, unit frame.
 
@@ -32,7 +54,7 @@ class FlashAppearance:
 
     def __init__(self, coat: Coat, intensity: float, shadows_from: float = np.inf):
         self.coat, self.intensity = coat, dr.opaque(mi.Float, intensity)
-        self.shadows_from, self.model = shadows_from, None
+        self.shadows_from, self.model, self.around = shadows_from, None, None
 
     def __call__(self, m: Marched, rays, cameras, learnt):
         F = m.features
@@ -46,6 +68,10 @@ class FlashAppearance:
         value = evaluate(Plastic(diffuse, specular, alpha), self.coat, n, -rays.d, l) * (inverse * self.intensity)
         if self.model.grid.n >= self.shadows_from:
             value *= self.visibility(dr.detach(x), dr.detach(n), position, m)
+        if self.around is not None:
+            leaves = self.coat.transmittance(dr.abs(dr.dot(n, rays.d)), alpha) / (1 - self.coat.internal(alpha))
+            arriving = self.around.at(rays.view, dr.detach(x)) * (self.intensity * self.around.enters * dr.inv_pi / self.coat.ior**2)
+            value += diffuse * arriving * leaves
         return value, n
 
     def visibility(self, x, n, position, m: Marched):
