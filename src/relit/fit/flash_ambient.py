@@ -80,7 +80,7 @@ def find_ambient(bank: PixelBank, cameras: list[Camera], mesh: Mesh, coat: Coat,
         if found.seen.sum() < 0.1 * len(x):
             return ambient
         albedo = np.where(found.seen[:, None], found.albedo, np.median(found.albedo[found.seen], axis=0))
-        albedo = np.clip(albedo * (brightest / np.percentile(albedo.max(1), 99)), 0, 1)
+        albedo = np.clip(albedo * (brightest / max(float(np.percentile(albedo.max(1), 99)), 1e-6)), 0, 1)
         base = albedo.T[:, :, None] * (enters * leaves_base)  # (3, places, 1)
         mirrored = MIRRORED * (1 - enters)
         light = np.zeros((3, len(x), bank.views))
