@@ -67,3 +67,17 @@ def test_the_prior_knows_what_is_up():
     assert np.isfinite(basis).all() and basis.shape[1] == ROWS * COLUMNS * 3
     turned = mean.reshape(ROWS, COLUMNS, 3)
     assert np.abs(turned - turned.mean(1, keepdims=True)).max() < 2e-2  # learnt under all turns: the mean has no azimuth
+
+
+def test_the_shipped_light_comes_from_above():
+    """Irradiance of the middle light on what faces up, aside and down: a ground of ordinary reflectance sends back a fifth to a half."""
+    from relit.conventions import environment_directions, environment_solid_angles
+    from relit.lighting.per_photo import COLUMNS, ROWS, light_prior
+
+    mean, basis = light_prior()
+    radiance = np.exp(mean).reshape(-1, 3)
+    directions = environment_directions(ROWS, COLUMNS).reshape(-1, 3)
+    angles = environment_solid_angles(ROWS, COLUMNS).ravel()
+    up, aside, down = ((np.maximum(directions @ np.array(n), 0) * angles) @ radiance for n in ([0, 1.0, 0], [1.0, 0, 0], [0, -1.0, 0]))
+    assert (up > 1.5 * aside).all() and (aside > 1.2 * down).all() and (0.2 * up < down).all() and (down < 0.5 * up).all()
+    assert basis.shape[0] >= 64

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.fit.broad_steps import BroadSteps
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
@@ -29,16 +30,21 @@ HISTORY = 1000  # losses in the ring buffer of posterior scaling
 
 @dataclass(frozen=True)
 class LightOptions:
-    """rate: step of the lights' numbers. prior: weight of |c|^2 / 2 per photo. neutral: of the mean chroma of all gains: without it, base
+    """rate: step of the lights' numbers. prior: weight of |c|^2 / 2 per photo. neutral: of the mean chroma of all lights: without it, base
     colour and lights drift apart in blue and orange. posterior: whether photos are scaled. anchor: weight of SAMURAI's L_init, the squared
-    difference of base colour and the photos' own pixels at even exposure; it falls to a tenth within the share lambda_a of the steps."""
+    difference of base colour and the photos' own pixels at even exposure; it falls to a tenth within the share lambda_a of the steps.
+    still: share of the steps in which the lights stay the prior's middle one, but for their gains: what all photos share is the object's.
+    broad: share of the steps in which base colour also takes `BroadSteps`, one each share `window` of the steps."""
 
     rate: float = 0.03
-    prior: float = 1e-3
+    prior: float = 3e-5
     neutral: float = 1.0
     posterior: bool = True
     anchor: float = 0.0
     lambda_a: float = 0.27
+    still: float = 0.1
+    broad: float = 0.3
+    window: float = 0.03
 
 
 def light_options(options: CollectionOptions) -> LightOptions:
@@ -113,6 +119,9 @@ def fit_collection_surface(
     running = np.zeros(views)
     exposure = mi.Float((np.exp(model.gains) * even).mean(1).astype(np.float32))
 
+    broad = None if frozen or first >= light.broad * options.steps else BroadSteps(mesh.mesh, options.texture)
+    window = max(5, round(light.window * options.steps))
+
     def step(i: int) -> dict:
         nonlocal running
         decay = cosine_decay(i / options.steps, 0.05)
@@ -175,19 +184,27 @@ def fit_collection_surface(
         gc = model.family.pull_back(model.coefficients, g) + light.prior / views * model.coefficients
         gg = g.reshape(views, TEXELS, 3).sum(1)
         if not frozen:
-            chroma = model.gains - model.gains.mean(1, keepdims=True)
+            chroma = model.gains + np.log(even)
+            chroma = chroma - chroma.mean(1, keepdims=True)
             gg = gg + light.neutral / views * np.mean(chroma, 0)
         rate = light.rate * decay
         if not frozen and options.exchange_rate > 0:
             move = exchange_scale(adam_s, material, gradients[1], gg, options.exchange_rate * decay)
             model.gains = model.gains + move
-        c = adam_c.step(mi.Float(model.coefficients.ravel()), mi.Float(gc.astype(np.float32).ravel()), 2 * rate)
+        moves = frozen or i >= light.still * options.steps
+        c = adam_c.step(mi.Float(model.coefficients.ravel()), mi.Float(gc.astype(np.float32).ravel()), 2 * rate if moves else 0.0)
         k = adam_g.step(mi.Float(model.gains.ravel()), mi.Float(gg.astype(np.float32).ravel()), rate)
         dr.eval(c, k)
         model.coefficients, model.gains = np.array(c).reshape(views, -1), np.array(k).reshape(views, 3)
         lights.radiance = dr.exp(mi.Float(model.lights().ravel()))
         dr.eval(lights.radiance)
         lights.rebuild()
+        if broad is not None and i < light.broad * options.steps:
+            broad.add(points.uv, display_weight(batch.rgb) * dr.select(valid, weight, 0), a, b, batch.rgb)
+            if i % window == window - 1:
+                material.colour = material.colour * mi.Float(broad.factors().ravel())
+                project(material)
+                dr.eval(material.colour)
         if light.posterior and not frozen:
             running = _watch(model, np.array(each), np.array(valid), np.array(batch.view), running, i, options.steps)
         return {"colour": fit}

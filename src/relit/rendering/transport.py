@@ -31,7 +31,7 @@ class TraceableMesh:
     carry no texels: they only block (the ground of a photo of duplicates)."""
 
     def __init__(self, mesh: Mesh, radiance: np.ndarray):
-        self.scene = build_geometry(mesh)
+        self.mesh, self.scene = mesh, build_geometry(mesh)
         self.origins = SmoothOrigins(mesh)
         self.faces, self.normals = self.origins.faces, self.origins.normals
         self.uvs = mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel())
