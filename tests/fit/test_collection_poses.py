@@ -114,3 +114,19 @@ def test_settling_never_ends_worse_than_it_began(photos, monkeypatch):
     means = iter([0.5, 0.6, 0.7])
     _, kept = collection_growth.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
     assert kept.mean() == pytest.approx(0.9)
+
+
+def test_photos_without_hints_end_upright(photos):
+    """A frame that is tilted as a whole is levelled by the photos' own upward directions; photos that are rolled at random leave it."""
+    from relit.conventions import similarity
+    from relit.fit.collection_growth import upright
+
+    poses = np.array([c.world_from_camera for *_, c in photos])
+    tilt = similarity(exp_so3(np.array([0.5, 0.1, -0.4])), np.zeros(3))
+    levelled = upright(tilt @ poses)
+    mean = -levelled[:, :3, 1].mean(0)
+    assert mean[1] / np.linalg.norm(mean) > 0.9999
+    relative = np.linalg.inv(levelled[0]) @ levelled[1]
+    assert np.allclose(relative, np.linalg.inv(poses[0]) @ poses[1], atol=1e-6)  # turned as a whole
+    cancelled = np.array([similarity(exp_so3(np.array([0, 0, a])), np.zeros(3)) for a in np.arange(12) * np.pi / 6])
+    assert np.array_equal(upright(cancelled), cancelled)

@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from relit.cameras.se3 import rotation_from
+from relit.conventions import similarity
 from relit.fit.collection_poses import (
     HOPELESS,
     PARTS,
@@ -35,6 +37,8 @@ from relit.fit.register import (
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
+LEVELLED = 0.3  # mean of the photos' upward directions below which they have none in common
+
 
 def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarray:
     """(n, n, n) bool: where the object may be when one photo was seen from `camera`: as thick as its outline is far."""
@@ -47,6 +51,17 @@ def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarra
     limit[ok] = np.minimum(to_outline[v[ok], u[ok]] * 1.4, 0.6)
     depth = np.abs(p @ camera.world_from_camera[:3, 2])
     return (depth < limit * loosen + 0.03).reshape(nodes, nodes, nodes)
+
+
+def upright(poses: np.ndarray) -> np.ndarray:
+    """The poses (P, 4, 4) turned about the origin so that the pictures' own upward directions have +y as their mean: cameras are held
+    upright more often than not, and tilts forward cancel over photos from all sides. Unchanged where the directions cancel, as for photos
+    that are rolled at random."""
+    mean = -poses[:, :3, 1].mean(0)
+    length = float(np.linalg.norm(mean))
+    if length < LEVELLED:
+        return poses
+    return similarity(rotation_from(mean / length, np.array([0.0, 1.0, 0.0])), np.zeros(3)) @ poses
 
 
 def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=None, nodes: int = 40):
@@ -111,7 +126,9 @@ def find_poses(
         poses, scores = poses_from_hints(crops, directions, degrees, schedule, seed, tell, keep, soft if keep > 1 else None)
     else:
         poses, scores = poses_by_growth(crops, starts, keep, seed, tell)
-    return polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held) if cycles > 0 else (poses, scores)
+    if cycles > 0:
+        poses, scores = polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held)
+    return (poses if hinted >= 0.5 else upright(poses)), scores
 
 
 def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
