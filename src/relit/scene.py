@@ -186,7 +186,7 @@ class Instance:
     """One of the identical objects in a photo of duplicates.
 
     label: its number in the label image. world_from_object: (4, 4) similarity from the asset frame, None where it was not registered.
-    reason: why not.
+    reason: why not; of one that was, what is uncertain about its pose.
     """
 
     label: int

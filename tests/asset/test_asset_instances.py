@@ -20,7 +20,11 @@ def asset():
     mesh = Mesh(np.asarray(box.vertices, np.float32), np.asarray(box.faces, np.int32), np.asarray(box.vertex_normals, np.float32))
     material = Material(np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1), 0.4, np.float32), np.zeros((1, 1), np.float32))
     poses = [similarity(exp_so3(np.array([0.2 * k, 1.0, 0])), [3 * k, 0, -5]) for k in range(2)]
-    instances = (Instance(42, poses[0]), Instance(85, None, "it agrees too little"), Instance(127, poses[1]))
+    instances = (
+        Instance(42, poses[0]),
+        Instance(85, None, "it agrees too little"),
+        Instance(127, poses[1], "ambiguous: turned by 90 degrees"),
+    )
     ground = Ground(np.array([0, -1, 0.0]), np.array([0, 1, 0.0]), 9.0, np.array([0.2, 0.3, 0.4]))
     return Asset(mesh, material, poses[0], None, (), {}, None, instances, ground)
 

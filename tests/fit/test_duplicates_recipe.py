@@ -56,6 +56,12 @@ def true_poses(pile, number=0):
     return np.array(poses)
 
 
+def stand_in(monkeypatch, poses, unsure=0.0):
+    """Let the search of the poses return these, the first of them being ambiguous by `unsure` degrees."""
+    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (poses, np.full(len(views), 0.95)))
+    monkeypatch.setattr(poses_stage, "ambiguous", lambda views, *_, **__: np.array([unsure] + [0.0] * (len(views) - 1)))
+
+
 def middle_of_pawn():
     vertices = pawn(rows=16, columns=20, texture=32)[0].vertices
     return (vertices.min(0) + vertices.max(0)) / 2
@@ -74,7 +80,7 @@ def test_objects_of_a_heap_stand_on_the_ground_and_hardly_in_one_another():
 
 
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
-    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (true_poses(pile), np.full(len(views), 0.95)))
+    stand_in(monkeypatch, true_poses(pile), unsure=90.0)
     capture = open_capture(pile)
     assert capture.kind == "duplicates" and len(np.unique(capture.photos[0].load().labels)) == 5
     small = {"levels": (24,), "level_steps": (12,), "rays": 512, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
@@ -84,6 +90,8 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
         resumed = recipe.reconstruct(capture, run, options, 0)
     assert np.allclose(asset.mesh.vertices, resumed.mesh.vertices)
     assert len(asset.instances) == 4 and all(i.registered for i in asset.instances)
+    assert "1 of 4 poses are ambiguous" in (run.folder / "log.txt").read_text()
+    assert [bool(i.reason) for i in asset.instances] == [True, False, False, False] and "90 degrees" in asset.instances[0].reason
     assert asset.ground is not None and asset.ground.normal[1] > 0.9  # the truth's ground is y = 0
     save_asset(tmp_path / "run" / "asset", asset)
     metrics = evaluate(tmp_path / "run", pile, spp=4)["metrics"]
@@ -116,13 +124,14 @@ def test_two_photos_of_one_pile(tmp_path, monkeypatch):
     capture = open_capture(pile)
     assert len(capture.photos) == 2
     told = np.concatenate([true_poses(pile, 0), true_poses(pile, 1)])
-    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (told, np.full(len(views), 0.95)))
+    stand_in(monkeypatch, told)
     small = {"levels": (24,), "level_steps": (6,), "rays": 256, "faces": 500, "texture": 32, "surface_steps": 2, "points": 64}
-    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48)
+    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48, metal_start=True)
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(capture, run, options, 0)
         log = (run.folder / "log.txt").read_text()
     assert [i.label for i in asset.instances] == [85, 170, 255] and all(i.registered for i in asset.instances)
+    assert "begins as metal" in log
     assert "photo 2 is turned by 35 degrees" in log and "3 instances in 2 photos" in log
     (_, first), (_, second) = asset.cameras
     true = [p.camera.world_from_camera for p in capture.photos]
@@ -138,7 +147,7 @@ def test_one_object_in_several_photos_runs_and_says_what_it_is(pile, tmp_path, m
     label = int(np.unique(pixels.labels[pixels.labels > 0])[0])
     alone = replace(photo, load=lambda: replace(pixels, labels=np.where(pixels.labels == label, label, 0).astype(np.int32)))
     told = true_poses(pile)[:1].repeat(2, 0)
-    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (told, np.full(len(views), 0.95)))
+    stand_in(monkeypatch, told)
     small = {"levels": (24,), "level_steps": (4,), "rays": 256, "faces": 500, "texture": 32, "surface_steps": 2, "points": 64}
     options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48, without=("matching",))
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:

@@ -12,7 +12,7 @@ from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_growth import Growth, grow, linked_poses
 from relit.fit.instance_lookup import look_for
-from relit.fit.instance_search import Guesses, Search, crops_of, first_pairs, place, reconsider, trusted
+from relit.fit.instance_search import APART, Guesses, Search, ambiguous, crops_of, first_pairs, place, reconsider, trusted
 from relit.fit.instances import albedo_render, carved, first_pose, fit_model, frame_scale, inflated, pixel_bank, views_of
 from relit.fit.pile_scene import find_ground
 from relit.fit.register import crop_rings, directions_around, make_gallery, search, views_from
@@ -135,9 +135,9 @@ def test_views_across_bound_what_one_leaves_open_in_depth():
     assert (carved([view, side], near, 24, 0.0, 1.0, crossed=True) < 0).sum() == (carved([view, side], near, 24, 0.0, 1.0) < 0).sum()
 
 
-def painted(angles) -> tuple[list, np.ndarray]:
+def painted(angles, axes=(0.5, 0.35, 0.7), contrast=0.7) -> tuple[list, np.ndarray]:
     """Views of an ellipsoid with a colour for each octant, turned by `angles` (degrees about +y), and their poses."""
-    axes, side = np.array([0.5, 0.35, 0.7]), 96
+    axes, side = np.array(axes), 96
     u, v = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5)
     camera = Camera(side, side, 260.0, 260.0, side / 2, side / 2, np.eye(4))
     d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
@@ -149,7 +149,7 @@ def painted(angles) -> tuple[list, np.ndarray]:
         b, e, c = (w * o).sum(-1), (w * w).sum(-1), o @ o - 1
         root = b * b - e * c
         p = (o + w * ((-b - np.sqrt(np.maximum(root, 0))) / e)[..., None]) * axes
-        colour = 0.15 + 0.7 * (p > np.array([0.05, 0.0, -0.1]))
+        colour = 0.15 + contrast * (p > np.array([0.05, 0.0, -0.1]))
         mask = (root > 0).astype(np.float32)
         rgb = (colour * mask[..., None]).astype(np.float32)
         views += views_of(rgb, (mask > 0).astype(np.int32) * (k + 1), camera, 10**6)
@@ -222,6 +222,14 @@ def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead(
     assert rotation_angle(found.poses[0, 0][:3, :3].T @ found.poses[0, 1][:3, :3]) >= 20
     whole = look_for(views[:1], crops_of(views[:1]), gallery, crop_rings(crops_of(views[:1]), parts), parts)
     assert np.array_equal(whole.poses, search(crops_of(views[:1]), gallery, rings=crop_rings(crops_of(views[:1]), parts)).poses)
+
+
+def test_poses_of_a_ball_are_ambiguous_and_those_of_a_painted_body_are_not():
+    o = Search(nodes=24, steps=12, viewpoints=300)
+    views, truth = painted([0, 25, 50])
+    assert (ambiguous(views, truth, o) == 0).all()
+    plain, poses = painted([0, 25, 50], axes=(0.5, 0.5, 0.5), contrast=0.0)
+    assert (ambiguous(plain, poses, o) >= APART).all()
 
 
 def test_instances_with_low_scores_are_not_trusted():

@@ -68,3 +68,27 @@ def test_an_empty_mask_is_refused():
 
     with pytest.raises(ValueError, match="empty"):
         crop_photo(np.zeros((20, 20, 3)), np.zeros((20, 20)), Camera(20, 20, 20, 20, 10, 10, np.eye(4)))
+
+
+def test_detail_tells_a_decoration_from_the_shading_on_it():
+    from relit.fit.register import SIDE, all_scores, rings_of
+
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
+    mask = ((x - 32) ** 2 + (y - 32) ** 2 < 22**2).astype(np.float32)
+
+    def spotted():
+        places = rng.uniform(14, 50, (14, 2))
+        spots = (np.hypot(x[..., None] - places[:, 0], y[..., None] - places[:, 1]) < 3).any(-1)
+        return np.repeat((0.6 - 0.35 * spots)[..., None], 3, 2).astype(np.float32)
+
+    ours, other = spotted(), spotted()
+    shade = np.exp(0.05 * (x - 32))[..., None].astype(np.float32)  # five times as bright on one side
+
+    def score(a, b, parts):
+        one, two = (rings_of((p * mask[..., None])[None].astype(np.float32), mask[None], parts=parts) for p in (a, b))
+        return float(all_scores(one, two)[0, 0, 0])
+
+    plain, fine = (0.6, 2.0, 0.6), (0.6, 1.0, 0.1, 0.6)
+    assert score(ours * shade, ours, fine) > score(other, ours, fine) + 0.2  # the same under another light, against another
+    assert score(ours * shade, ours, plain) < score(ours * shade, ours, fine) - 0.1

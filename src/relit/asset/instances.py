@@ -3,7 +3,8 @@
     {"instances": [{"label": 42, "world_from_object": 4x4, "registered": true}, {"label": 85, "registered": false, "reason": "..."}],
      "ground": {"point": [x, y, z], "normal": [x, y, z], "radius": r, "colour": [r, g, b], "roughness": .8}}
 
-The object frame is the asset frame (the GLB's coordinates after its node transforms), the world that of `cameras.json`.
+A registered instance has a reason where its pose is uncertain. The object frame is the asset frame (the GLB's coordinates after its node
+transforms), the world that of `cameras.json`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def write_instances(folder: Path, asset: Asset) -> None:
         entry: dict = {"label": int(i.label), "registered": i.registered}
         if i.registered:
             entry["world_from_object"] = np.asarray(i.world_from_object, np.float64).tolist()
-        else:
+        if i.reason or not i.registered:
             entry["reason"] = i.reason
         listed.append(entry)
     data: dict = {"instances": listed}

@@ -37,6 +37,11 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
         "radii",
         "median distance of the objects' centres from the true ones after the one scale about the camera, in radii",
     ),
+    "surface_median": (
+        "radii",
+        "median over registered instances of the mean distance between points of the true surface where it stands and the nearest of it at "
+        "the recovered pose (ADD-S), after the one scale about the camera: a turn that the shape does not tell costs nothing",
+    ),
     "registered": ("%", f"share of the instances of which {VISIBLE:.0%} or more are visible that are registered within 10 degrees"),
     "albedo_psnr": ("dB", f"base colour, one factor per channel over all test views, sRGB-encoded, {MASKED}; mean of the per-view PSNR"),
     "roughness_mse": ("", f"perceptual roughness, {MASKED}"),
@@ -100,6 +105,7 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     scale, frame = scene_alignment(poses, true_poses, photo, true_points, asset)
     radius = truth["radius"]
     values["translation_median"] = centre_error(poses, true_poses, photo, scale, frame, true_points) / radius
+    values["surface_median"] = surface_error(poses, true_poses, photo, scale, frame, true_points[:: SAMPLES // 2000]) / radius
     own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
     values["chamfer"] = chamfer(true_points, own, frame)
 
@@ -322,6 +328,16 @@ def centre_error(poses, true_poses, photo: Camera, scale: float, frame: np.ndarr
         np.linalg.norm(move_points(grow @ poses[k] @ frame, middle) - move_points(true_poses[k], middle)) for k in poses if k in true_poses
     ]
     return float(np.median(distances))
+
+
+def surface_error(poses, true_poses, photo: Camera, scale: float, frame: np.ndarray, true_points: np.ndarray) -> float:
+    """ADD-S (Xiang et al. 2018, PoseCNN, Sec. V-A), the median over instances, in units of the scene."""
+    from scipy.spatial import cKDTree
+
+    grow = grown_about(photo.centre, scale)
+    known = [k for k in poses if k in true_poses]
+    found = [cKDTree(move_points(grow @ poses[k] @ frame, true_points)).query(move_points(true_poses[k], true_points))[0] for k in known]
+    return float(np.median([d.mean() for d in found]))
 
 
 def chamfer(true_points: np.ndarray, own: np.ndarray, frame: np.ndarray) -> float:

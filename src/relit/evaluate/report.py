@@ -198,11 +198,18 @@ def _textures(asset: Asset) -> str:
 
 def _notes(run: Path, asset: Asset) -> str:
     notes = read_json(run / "stages" / "asset" / "notes.json") or []
-    lines = [str(n) for n in notes] or ["The reader had nothing to remark."]
+    said = [line.split("note: ", 1)[1].strip() for line in read_log(run) if "  note: " in line]
+    lines = list(dict.fromkeys([*(str(n) for n in notes), *said])) or ["Nothing was remarked."]
     versions = asset.meta.get("versions")
     if isinstance(versions, dict):
         lines.append("made with " + ", ".join(f"{k} {v}" for k, v in versions.items()))
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def read_log(run: Path) -> list[str]:
+    """The lines of the run's log, none where there is no log."""
+    file = run / "log.txt"
+    return file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
 
 
 def _files(run: Path) -> str:

@@ -27,6 +27,7 @@ from relit.fit.duplicates_options import DuplicatesOptions, options_for
 from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.instance_search import Search
 from relit.fit.instances import ANOTHER_PHOTO, View, carved, move_poses, moved_poses, pixel_bank
+from relit.fit.metal import PAINT, metal_start
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
@@ -58,7 +59,7 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     shots = [(with_normals(p.load(), options), p.camera.with_pose(np.eye(4))) for p in photos]
     if len(photos) > 1 and all(len(np.unique(pixels.labels[pixels.labels > 0])) == 1 for pixels, _ in shots):
         run.say(f"note: one object in {len(photos)} photos: it is placed by search; from all around --capture multiview is more exact")
-    poses, registered, keys = poses_stage(shots, run, options, seed)
+    poses, registered, keys, unsure = poses_stage(shots, run, options, seed)
     chosen = [k for k in range(len(keys)) if registered[k]]
     views = [v for v in all_views(shots, options.side, options) if v.key in {keys[k] for k in chosen}]
     poses = poses[chosen]
@@ -69,7 +70,7 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     camera = photos[0].camera
     maps = run_arrays(run, "surface", "maps") if run.done("surface") else surface_stage(shots, camera, mesh, parts, run, options, seed)
-    return assemble(photos, mesh, maps, parts, [int(k) for k in keys])
+    return assemble(photos, mesh, maps, parts, dict(zip(keys.tolist(), unsure.tolist(), strict=True)))
 
 
 def labelled_photos(capture: Capture) -> tuple:
@@ -219,10 +220,14 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         start = fill_gutters(interpolate(parts["base"], mesh.faces, face, bary), known)
         areas = vertex_areas(mesh)
         level = float((parts["radiance"].mean(0) * areas[:, None]).sum() / areas.sum() / 3)
-        model = start_surface(start, known, level, o)
+        traced, metallic = TraceableMesh(whole, radiance), PAINT
+        if options.metal_start and stage.load("checkpoint") is None:
+            metallic = metal_start(bank, traced, start, known, level, None, o, seed)
+            run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
+        model = start_surface(start, known, level, o, None, metallic)
         if options.gaussians:
             model.gaussians = GaussianLight(options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START)
-        fit_surface(bank, TraceableMesh(whole, radiance), model, o, stage, seed)
+        fit_surface(bank, traced, model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)
         environment = model.environment.image()
         ground = ground_level
@@ -245,9 +250,10 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
 # ---------------------------------------------------------------- asset
 
 
-def assemble(photos, mesh: Mesh, maps, parts, keys: list[int]) -> Asset:
+def assemble(photos, mesh: Mesh, maps, parts, keys: dict[int, float]) -> Asset:
     """The asset: the object +Y up where a ground was found (as the first instance stands), its instances in the user's world, whose unit is
-    the unit of the fit (one photo does not know the scale)."""
+    the unit of the fit (one photo does not know the scale). keys: of the instances, each with the degrees by which it may be turned as
+    well, or 0."""
     world_from_photo = photos[0].camera.world_from_camera
     world_from_unit = [world_from_photo @ np.linalg.inv(p) for p in parts["poses"]]
     plane = parts["plane"]
@@ -262,9 +268,10 @@ def assemble(photos, mesh: Mesh, maps, parts, keys: list[int]) -> Asset:
     world_from_object = [m @ np.linalg.inv(asset_from_unit) for m in world_from_unit]
     instances = []
     placed_keys, shown = parts["keys"].tolist(), parts["view_keys"].tolist()
-    for key in keys:
+    for key, other in keys.items():
         if key in placed_keys:
-            instances.append(Instance(key, world_from_object[placed_keys.index(key)]))
+            doubt = f"ambiguous: turned by {other:.0f} degrees it agrees about as well" if other else ""
+            instances.append(Instance(key, world_from_object[placed_keys.index(key)], doubt))
         elif key not in shown and (key < ANOTHER_PHOTO or parts["related"][key // ANOTHER_PHOTO]):
             instances.append(Instance(key, None, "it agrees too little with the model of the others"))
     ground = None

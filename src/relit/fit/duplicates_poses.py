@@ -12,7 +12,7 @@ import numpy as np
 from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
-from relit.fit.instance_search import Search, place
+from relit.fit.instance_search import Search, ambiguous, place
 from relit.fit.instances import COARSE, View, carved, views_of
 from relit.scene import Camera, Pixels
 
@@ -31,12 +31,14 @@ def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[
 
 
 def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
-    """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,)) of all views, in the unit frame of the object."""
+    """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,), unsure (N,) degrees) of all views, in the unit frame of the
+    object. unsure: see `instance_search.ambiguous`."""
     from relit.fit.multiview import run_arrays
 
     if run.done("poses"):
         saved = run_arrays(run, "poses", "poses")
-        return saved["poses"], saved["registered"], saved["labels"]
+        unsure = saved.get("unsure", np.zeros(len(saved["labels"])))
+        return saved["poses"], saved["registered"], saved["labels"], unsure
     views = all_views(shots, COARSE, options)
     with run.stage("poses", title="poses of the instances") as stage:
         matched = None if "matching" in options.without else match_instances(shots, run, options, seed)
@@ -58,14 +60,27 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
             raise UserError("hardly any instance could be placed", "see the scores in the log", "check the label image", code=EXIT_FAILED)
         for k in np.flatnonzero(~registered):
             run.say(f"note: the object with {named(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only")
-        if len(views) > 1 and scores[registered].std() < 0.002 and scores.min() > 0.985:
-            run.say("note: all poses fit equally well: a symmetric or textureless object leaves them ambiguous")
+        unsure = np.zeros(len(views))
+        if registered.sum() > 2 and "refinement" not in options.without:
+            unsure[registered] = ambiguous([v for v, ok in zip(views, registered, strict=True) if ok], poses[registered], search, seed=seed)
+            say_ambiguous(views, unsure, int(registered.sum()), run)
         if matched and not {"guided", "refinement"} & set(options.without):
             poses = adjusted_poses(matched, poses, registered, run)
         poses = centred(views, poses, registered)
         keys = np.array([v.key for v in views])
-        stage.save("poses", poses=poses, registered=registered, labels=keys, scores=scores)
-    return poses, registered, keys
+        stage.save("poses", poses=poses, registered=registered, labels=keys, scores=scores, unsure=unsure)
+    return poses, registered, keys, unsure
+
+
+def say_ambiguous(views: list[View], unsure: np.ndarray, registered: int, run) -> None:
+    """Say whose poses the pictures do not tell. unsure: (N,) degrees, see `instance_search.ambiguous`."""
+    some = [named(views[k]).removeprefix("label ") for k in np.flatnonzero(unsure)]
+    if some:
+        run.say(
+            f"note: {len(some)} of {registered} poses are ambiguous (labels {', '.join(some)}): these objects agree about as well with the "
+            f"model when turned by {np.median(unsure[unsure > 0]):.0f} degrees; the object is nearly symmetric, its texture repeats, or "
+            "what tells is hidden"
+        )
 
 
 def named(view: View) -> str:
@@ -134,9 +149,7 @@ def adjusted_poses(matched: Matched, poses: np.ndarray, registered: np.ndarray, 
         )
     if count:
         turns = [rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(out[chosen], poses[chosen], strict=True)]
-        run.say(
-            f"matches guided by the poses link {count} pairs; bundle adjustment turns the instances by {np.median(turns):.1f} degrees"
-        )
+        run.say(f"matches guided by the poses link {count} pairs; bundle adjustment turns the instances by {np.median(turns):.1f} degrees")
     return out
 
 

@@ -28,10 +28,10 @@ from relit.fit.register import (
 )
 
 # weights in fit.register's descriptors: one photo, one light, so brightness tells more than across photos; colourful objects do with less
-# of it
-PARTS, COLOURFUL = (0.5, 2.0, 0.6), (0.6, 2.0, 0.1)
-
+# of it; whether another pose would do as well is judged in detail
+PARTS, COLOURFUL, DETAILED = (0.5, 2.0, 0.6), (0.6, 2.0, 0.1), (0.6, 1.0, 0.1, 0.6)
 APART = 25.0  # degrees from which on a pose is another one
+UNSURE = 0.3  # see `ambiguous`
 GAP = 0.1  # an instance's score may lie so much below those of the best third
 
 
@@ -199,9 +199,11 @@ def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, part
     return poses, scores, moved
 
 
-def elsewhere(views, crops, rings, poses, o: Search, *, seed: int, parts=PARTS):
-    """How well each instance agrees with the model of all where it stands, (N,), how well at best at least APART degrees from there, (N,),
-    and how many degrees that is, (N,). Where the second is about as high as the first the picture does not tell the pose."""
+def ambiguous(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0) -> np.ndarray:
+    """(N,) degrees by which another pose of an instance that the pictures hardly tell from its own is turned against it, 0 where there is
+    none: it agrees with the model of all so well that what the own one falls short of 1 grows by less than the share UNSURE."""
+    parts, crops = DETAILED, crops_of(views)
+    rings = crop_rings(crops, parts)
     values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
     model, _ = fit_model(views, poses, values, 2 * o.steps, seed=seed)
     render = albedo_render(model)
@@ -209,13 +211,13 @@ def elsewhere(views, crops, rings, poses, o: Search, *, seed: int, parts=PARTS):
     far = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
     gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed), far), parts)
     found = look_for(views, crops, gallery, rings, parts, keep=3, apart=APART)
-    best, angle = np.full(len(views), -1.0), np.zeros(len(views))
-    for n in range(3):
+    best, angle = own - UNSURE * (1 - own), np.zeros(len(views))
+    for n in range(found.poses.shape[1]):
         other, score = refine(crops, found.poses[:, n], render, rings=rings, steps=(0, 4.0, 2.0), parts=parts)
         away = np.array([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(other, poses, strict=True)])
         better = (away >= APART) & (score > best)
         best, angle = np.where(better, score, best), np.where(better, away, angle)
-    return own, best, angle
+    return angle
 
 
 def trusted(scores: np.ndarray, gap: float = GAP) -> np.ndarray:

@@ -39,10 +39,11 @@ def metal_start(
 ) -> np.ndarray:
     """(S, S) float32, the metallic to begin with. base, known, radiance, normals: as of `start_surface`."""
     o = replace(options, steps=min(STEPS, options.steps // 2), **TRIAL)
-    small = [cv2.resize(np.asarray(a, np.float32), (TEXTURE, TEXTURE), interpolation=cv2.INTER_AREA) for a in (base, known, normals)]
+    given = (base, known) if normals is None else (base, known, normals)
+    small = [cv2.resize(np.asarray(a, np.float32), (TEXTURE, TEXTURE), interpolation=cv2.INTER_AREA) for a in given]
     fits = []
     for side in SIDES:
-        model = start_surface(small[0], small[1] > 0.5, radiance, o, small[2], side)
+        model = start_surface(small[0], small[1] > 0.5, radiance, o, None if normals is None else small[2], side)
         fits.append(fit_surface(bank, mesh, model, o, NoStage(), seed))
     colour = np.sqrt(np.maximum(base, 0) / max(float(base[known].mean()), 1e-6))
     centres, group = groups_of(colour, known)

@@ -21,7 +21,7 @@ import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from relit.cameras.se3 import exp_so3, look_at, rotation_angle, rotation_from
 from relit.conventions import similarity
@@ -34,7 +34,8 @@ SIDE = 64  # pixels of crops and renderings
 REACH = 2.4  # half the side of a crop, in spreads of the silhouette (a disc's edge lies at 1.41, a rod's at 1.73)
 RINGS, TURNS = 18, 72
 RING_REACH = 2.1  # outermost ring, in spreads
-PARTS = (0.6, 2.0, 0.15)  # weights of silhouette, chromaticity and log luminance
+FINE = 3.0  # pixels, standard deviation of the surroundings that detail is told from
+PARTS = (0.6, 2.0, 0.15)  # weights of silhouette, chromaticity and log luminance, and where there are four of detail (see `detail`)
 AHEAD = np.array([0.0, 0.0, 1.0])  # the optical axis in a camera's own axes
 CHUNK = 1 << 20  # rays that are rendered at a time
 
@@ -210,7 +211,10 @@ def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None
     bright = (bright - mean[:, None, None]) * (a > 0.5)
     deviation = np.sqrt((bright**2 * inside).sum((1, 2)) / total)
     bright = np.clip(bright / (deviation[:, None, None] + 0.02), -2.5, 2.5)
-    f = np.concatenate([parts[0] * a[..., None], parts[1] * chroma, parts[2] * bright[..., None]], -1)  # (N, RINGS, TURNS, 5)
+    channels = [parts[0] * a[..., None], parts[1] * chroma, parts[2] * bright[..., None]]
+    if len(parts) > 3:
+        channels.append(parts[3] * (look(detail(rgb, mask)) * (a > 0.5))[..., None])
+    f = np.concatenate(channels, -1)  # (N, RINGS, TURNS, channels)
     weighted = f * area[..., None]
 
     def spectrum(g):
@@ -219,6 +223,19 @@ def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None
     squares = (f * f).sum(-1)
     norm = np.sqrt((squares * area).sum((1, 2)))
     return Rings(spectrum(weighted), spectrum(f), spectrum(squares), spectrum(area), norm, centre, spread)
+
+
+def detail(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(N, S, S) log luminance against its surroundings on the object, in standard deviations: decoration without most of the shading."""
+    inside = (mask > 0.5).astype(np.float32)
+    count = np.maximum(inside.sum((1, 2)), 1)
+    level = rgb.mean(-1) / np.maximum(mask, 0.05) * inside
+    usual = np.maximum(level.sum((1, 2)) / count, 1e-4)
+    bright = np.log(level / usual[:, None, None] + 0.1) * inside
+    around = gaussian_filter(bright, (0, FINE, FINE)) / np.maximum(gaussian_filter(inside, (0, FINE, FINE)), 1e-3)
+    fine = (bright - around) * inside
+    deviation = np.sqrt((fine**2).sum((1, 2)) / count)
+    return np.clip(fine / (deviation[:, None, None] + 0.03), -2.5, 2.5).astype(np.float32)
 
 
 def moments(known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
