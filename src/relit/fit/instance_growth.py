@@ -13,9 +13,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from relit.conventions import similarity
-from relit.fit.instance_lookup import look_for
 from relit.fit.instances import View, albedo_render, carved, first_pose, fit_model
-from relit.fit.register import Crop, Gallery, Render, Rings, directions_around, refine, rings_of, views_from
+from relit.fit.register import Crop, Gallery, Render, Rings, directions_around, refine, rings_of, search, views_from
 
 
 @dataclass(frozen=True)
@@ -82,8 +81,8 @@ def registered(views, crops, rings: Rings, parts, render: Render, poses, members
     cameras = views_from(directions[close], far)
     rgb, alpha = render(cameras)
     theirs, some = chosen_rings(rings, rest), [crops[k] for k in rest]
-    gallery = Gallery(cameras, rings_of(rgb, alpha, parts=parts))
-    found = look_for([views[k] for k in rest], some, gallery, theirs, parts, keep=o.keep)
+    # not look_for: what is hidden in part would fit early, and wrongly
+    found = search(some, Gallery(cameras, rings_of(rgb, alpha, parts=parts)), keep=o.keep, rings=theirs)
     tries = [found.poses[:, j] for j in range(o.keep)]
     told = linked_poses(views, poses, members, rest, links, far)
     if told:

@@ -24,6 +24,7 @@ from relit.fit.register import (
     make_gallery,
     refine,
     rings_of,
+    search,
     views_from,
 )
 
@@ -98,7 +99,7 @@ def pair_guesses(views: list[View], crops, chosen: list[int], o: Search, distanc
         rgb, alpha = albedo_render(model)(cameras)
         for parts, guesses in out.items():
             gallery = Gallery(cameras, rings_of(rgb, alpha, parts=parts))
-            found = look_for(views, crops, gallery, rings[parts], parts, keep=o.keep, apart=25.0)
+            found = search(crops, gallery, keep=o.keep, rings=rings[parts], apart=25.0)
             guesses.poses[s], guesses.scores[s] = found.poses, found.scores
             guesses.poses[s, k], guesses.scores[s, k] = pose, -1.0
         say(s + 1, len(chosen))
