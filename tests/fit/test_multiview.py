@@ -170,7 +170,7 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
 
     monkeypatch.setattr(module, "run_steps", watching)
     with Run.open(tmp_path / "run", {}) as run:
-        reconstruct(open_capture(capture_folder), run, replace(TINY, without=("metal_start",)), 0)
+        reconstruct(open_capture(capture_folder), run, replace(TINY, without=("first_material",)), 0)
     assert len(late) >= 12
     assert [new for new, _, _ in late] == [0] * len(late)
     assert sum(seconds for _, seconds, _ in late) == 0
@@ -178,7 +178,7 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
 
 
 NAMES = ["hull", "interreflection", "exchange", "material_prior", "colour_smoothing", "light_prior", "white", "parsimony"]
-NAMES += ["normal_map", "metal_start"]
+NAMES += ["normal_map", "first_material"]
 
 
 @pytest.mark.parametrize("without", NAMES)

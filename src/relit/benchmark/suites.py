@@ -90,7 +90,7 @@ MULTIVIEW = Suite(
         "white": ("without=white",),
         "parsimony": ("without=parsimony",),
         "normal_map": ("without=normal_map",),
-        "metal_start": ("without=metal_start",),
+        "first_material": ("without=first_material",),
         "priors": ("without=material_prior,colour_smoothing,light_prior",),
     },
 )

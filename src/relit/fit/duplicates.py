@@ -25,9 +25,9 @@ from relit.conventions import move_points, similarity
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions, options_for
 from relit.fit.duplicates_poses import all_views, poses_stage
+from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.instance_search import Search
 from relit.fit.instances import ANOTHER_PHOTO, View, carved, move_poses, moved_poses, pixel_bank
-from relit.fit.metal import PAINT, metal_start
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
@@ -220,11 +220,11 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         start = fill_gutters(interpolate(parts["base"], mesh.faces, face, bary), known)
         areas = vertex_areas(mesh)
         level = float((parts["radiance"].mean(0) * areas[:, None]).sum() / areas.sum() / 3)
-        traced, metallic = TraceableMesh(whole, radiance), PAINT
-        if options.metal_start and stage.load("checkpoint") is None:
-            metallic = metal_start(bank, traced, start, known, level, None, o, seed)
-            run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
-        model = start_surface(start, known, level, o, None, metallic)
+        traced, metallic, roughness = TraceableMesh(whole, radiance), PAINT, None
+        if options.first_material and stage.load("checkpoint") is None:
+            metallic, roughness = first_material(bank, traced, start, known, level, None, o, seed)
+            run.say(describe(metallic, roughness, known))
+        model = start_surface(start, known, level, o, None, metallic, roughness)
         if options.gaussians:
             model.gaussians = GaussianLight(options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START)
         fit_surface(bank, traced, model, o, stage, seed)

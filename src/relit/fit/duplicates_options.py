@@ -13,8 +13,9 @@ class DuplicatesOptions:
     """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for all poses. levels, level_steps, rays:
     of the volume pass. refine_poses: step of the pose corrections in it (radians, unit lengths). faces, texture: of the object.
     surface_steps, points, directions, light: of the surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for
-    a map. metal_start: look for metal before the surface pass (`fit.metal`). max_pixels: of the photos. matcher: 'module:function', see
-    `cameras.matcher`. normal_network: an ONNX file, see `capture.networks`. without: parts that are switched off, names of WITHOUT.
+    a map. first_material: look for metal and dull paint before the surface pass (`fit.first_material`). max_pixels: of
+    the photos. matcher: 'module:function', see `cameras.matcher`. normal_network: an ONNX file, see `capture.networks`. without: parts
+    that are switched off, names of WITHOUT.
     """
 
     side: int = 320
@@ -30,7 +31,7 @@ class DuplicatesOptions:
     directions: int = 48
     light: int = 64
     gaussians: int = 0
-    metal_start: bool = False
+    first_material: bool = False
     max_pixels: int = 4_000_000
     matcher: str = ""
     normal_network: str = ""

@@ -1,11 +1,11 @@
 """Photos around an object under one fixed, unknown light -> a relightable asset. The recipe of the `multiview` capture.
 
-    photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
-    hull       visual hull of the masks, or without masks the fused depths of a radiance field of the whole scene   fit/explore.py
-    volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
-    mesh       zero level set, decimated; texture atlas; mean radiance per vertex
-    surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/surface.py
-    asset      textures with filled gutters, everything back in the frame of the user's cameras
+photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
+hull       visual hull of the masks, or without masks the fused depths of a radiance field of the whole scene   fit/explore.py
+volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
+mesh       zero level set, decimated; texture atlas; mean radiance per vertex
+surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/surface.py
+asset      textures with filled gutters, everything back in the frame of the user's cameras
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from relit.conventions import move_points, move_pose, similarity, srgb_from_line
 from relit.errors import UserError, did_you_mean
 from relit.files import write_text
 from relit.fit.explore import explore, first_shape
-from relit.fit.metal import PAINT, metal_start
+from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras, sphere_pixels
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
@@ -47,7 +47,8 @@ class MultiviewOptions:
     normal: weight of normal priors read from files. background, explore_steps: nodes a side of the radiance
     field for photos without masks, and the steps that fit it.
     faces: of the mesh, about. texture: texels a side. surface_steps, points, directions: steps of the surface pass, pixels per step,
-    directions per pixel. light: rows of the environment map. without: parts of the surface pass that are switched off, names of WITHOUT.
+    directions per pixel. light_steps: after so many of them the light rests (0: never). light: rows of the environment map. without:
+    parts of the surface pass that are switched off, names of WITHOUT.
     """
 
     levels: tuple[int, ...] = (128, 256)
@@ -60,7 +61,8 @@ class MultiviewOptions:
     explore_steps: int = 400
     faces: int = 40_000
     texture: int = 512
-    surface_steps: int = 4500
+    surface_steps: int = 3000
+    light_steps: int = 1200
     points: int = 4096
     directions: int = 32
     light: int = 64
@@ -73,6 +75,7 @@ class MultiviewOptions:
 
 
 SMOOTH_COLOUR = 0.1  # of SurfaceOptions: here many photos see each place under one light
+LIGHT_EVEN = 1e-3  # of SurfaceOptions: holds the light where photos do not tell it from base colour
 
 WITHOUT = {  # what an ablation switches off: settings of the surface pass
     "interreflection": {},  # what blocks a direction is black
@@ -80,10 +83,10 @@ WITHOUT = {  # what an ablation switches off: settings of the surface pass
     "white": {"bright": 0.0},
     "material_prior": {"smooth_roughness": 0.0, "smooth_metallic": 0.0, "metallic_binary": 0.0, "metallic_sparse": 0.0},
     "colour_smoothing": {"smooth_colour": 0.0},
-    "light_prior": {"light_smooth": 0.0, "light_neutral": 0.0},
+    "light_prior": {"light_smooth": 0.0, "light_neutral": 0.0, "light_even": 0.0},
     "parsimony": {"parsimony": 0.0},
     "normal_map": {"slope_rate": 0.0},
-    "metal_start": {},  # every place begins as paint
+    "first_material": {},  # every place begins as paint of one roughness
 }
 
 PRESETS = {
@@ -97,6 +100,7 @@ PRESETS = {
         "faces": 12_000,
         "texture": 256,
         "surface_steps": 700,
+        "light_steps": 500,
         "points": 2048,
         "light": 32,
     },
@@ -109,7 +113,8 @@ PRESETS = {
         "explore_steps": 800,
         "faces": 60_000,
         "texture": 1024,
-        "surface_steps": 8000,
+        "surface_steps": 6000,
+        "light_steps": 1600,
     },
 }
 
@@ -126,8 +131,9 @@ def volume_options(o: MultiviewOptions) -> VolumeOptions:
 
 
 def surface_options(o: MultiviewOptions) -> SurfaceOptions:
-    off = {key: value for name in o.without for key, value in WITHOUT[name].items()}
-    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **{"smooth_colour": SMOOTH_COLOUR, **off})
+    own = {"smooth_colour": SMOOTH_COLOUR, "light_even": LIGHT_EVEN, "light_steps": o.light_steps}
+    own |= {key: value for name in o.without for key, value in WITHOUT[name].items()}
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **own)
 
 
 def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0) -> Asset:
@@ -306,11 +312,11 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
         normals = fill_gutters(interpolate(mesh.normals, mesh.faces, face, bary), known)
         reflecting = radiance * (0.0 if "interreflection" in options.without else 1.0)
         traced = TraceableMesh(mesh, reflecting)
-        metallic = PAINT
-        if "metal_start" not in options.without and stage.load("checkpoint") is None:
-            metallic = metal_start(bank, traced, start, known, mean, normals, o, seed)
-            run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
-        model = start_surface(start, known, mean, o, normals, metallic)
+        metallic, roughness = PAINT, None
+        if "first_material" not in options.without and stage.load("checkpoint") is None:
+            metallic, roughness = first_material(bank, traced, start, known, mean, normals, o, seed)
+            run.say(describe(metallic, roughness, known))
+        model = start_surface(start, known, mean, o, normals, metallic, roughness)
         fit_surface(bank, traced, model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)
         maps = {

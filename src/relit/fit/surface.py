@@ -20,7 +20,7 @@ from relit.fit.pixels import PixelBank, batch_of, draw_pixels
 from relit.fit.preview import surface_preview
 from relit.lighting.environment import Environment
 from relit.lighting.gaussian_light import GaussianLight
-from relit.materials.field import MaterialField, material_at, project, slope_at, start_material
+from relit.materials.field import MaterialField, material_at, nearest_texel, project, slope_at, start_material
 from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 
 ALBEDO_START = 0.4  # mean base colour at the start; light and albedo share one unknown scale
@@ -33,14 +33,16 @@ class SurfaceOptions:
     columns).
 
     colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step; exchange_rate:
-    of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of the steps over which colour_rate
+    of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of light_steps over which colour_rate
     rises from a twentieth. roughness_start: first roughness. smooth_roughness, smooth_metallic, smooth_colour: weights of differences
     between similar neighbours, up to similarity_reach (unit frame) apart and similarity_width in base colour; smooth_shade: power of
-    `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary, metallic_sparse: of m (1 - m) and of m. bright: of base
-    colour beyond WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma. parsimony, parsimony_width,
-    parsimony_share: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves.
-    slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser
-    (see `Adam`), so that noise does not move it at full rate.
+    `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary, metallic_sparse: of m (1 - m), and of the distance of
+    m from the side that a place began on, 0 or 1. bright: of base colour beyond WHITE, squared. light_smooth: total variation of the log
+    radiance. light_neutral: its chroma; light_even: its squared distance from its mean. light_steps: after them the light rests, and
+    `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width, parsimony_share: see `parsimony`. slope_rate,
+    slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth: weights of `slope_prior`,
+    whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise does not move it at full
+    rate.
     """
 
     steps: int = 700
@@ -67,6 +69,8 @@ class SurfaceOptions:
     bright: float = 0.3
     light_smooth: float = 0.002
     light_neutral: float = 2e-4
+    light_even: float = 0.0
+    light_steps: int = 0
     scale_power: float = 0.5
     parsimony: float = 0.02
     parsimony_width: float = 0.1
@@ -83,29 +87,34 @@ class SurfaceOptions:
 class SurfaceModel:
     """material: the textures. log_light: Float [rows * 2 rows * 3], log radiance, lat-long in the unit frame. environment: exp of it.
     normals: (S, S, 3) unit normals of the texels, or None. gaussians: what log_light is rendered from, where the light is to be spherical
-    Gaussians, or None."""
+    Gaussians, or None. metal: Float [S²], 1 where the surface begins as metal, 0 elsewhere."""
 
     material: MaterialField
     log_light: Any
     environment: Environment
+    metal: Any
     normals: np.ndarray | None = None
     gaussians: GaussianLight | None = None
 
 
 def start_surface(
-    base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions, normals=None, metallic=0.1
+    base: np.ndarray, known: np.ndarray, radiance: float, options: SurfaceOptions, normals=None, metallic=0.1, roughness=None
 ) -> SurfaceModel:
     """base: (S, S, 3) first guess of the base colour up to scale (materials.intrinsic), known: (S, S) bool, radiance: mean over the object,
-    normals: (S, S, 3) of the texels, None where they stand in many places. metallic: a number or (S, S).
+    normals: (S, S, 3) of the texels, None where they stand in many places. metallic, roughness (None: roughness_start): a number or
+    (S, S).
 
     The light starts grey and even, bright enough that the mean base colour is ALBEDO_START.
     """
     mean = float(base[known].mean())
     albedo = np.clip(base * (ALBEDO_START / max(mean, 1e-6)), 0.02, 0.95)
-    material = start_material(options.texture, albedo, options.roughness_start, metallic)
+    rough = options.roughness_start if roughness is None else roughness
+    material = start_material(options.texture, albedo, rough, metallic)
     h = options.light
     log_light = mi.Float(np.full(h * 2 * h * 3, np.log(max(radiance, 1e-4) / ALBEDO_START), np.float32))
-    return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h), normals)
+    metal = dr.select(material.metallic > 0.5, mi.Float(1), 0)
+    dr.eval(metal)
+    return SurfaceModel(material, log_light, Environment(dr.exp(log_light), h, 2 * h), metal, normals)
 
 
 def light_parameters(model: SurfaceModel):
@@ -121,7 +130,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     if saved:
         first = int(saved["step"])
         material.colour, material.metallic = mi.Float(saved["colour"]), mi.Float(saved["metallic"])
-        material.slope = mi.Float(saved["slope"])
+        material.slope, model.metal = mi.Float(saved["slope"]), mi.Float(saved["metal"])
         if gaussians is None:
             model.log_light = mi.Float(saved["light"])
         else:
@@ -135,12 +144,14 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     exchange = Exchange(model.normals, material.size**2, options.light, options.exchange_rows)
     adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, light_parameters(model)))
     adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
+    light_steps = options.light_steps or options.steps
     ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
     ratio = mi.Float(ratio)
 
     def step(i: int) -> dict:
         decay = cosine_decay(i / options.steps, 0.05)
-        warm = min(1.0, 0.05 + (i / (options.warm * options.steps)) ** 2)  # the light first: base colour could explain all shading at once
+        light_decay = cosine_decay(i / light_steps, 0.05) * (i < light_steps)
+        warm = min(1.0, 0.05 + (i / (options.warm * light_steps)) ** 2)  # the light first: base colour could explain all shading at once
         batch, points = drawn_points(bank, mesh, rng, count)
         valid = points.valid
         near = neighbours(mesh, points, options.similarity_reach, rng)
@@ -149,13 +160,15 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (count - 1))
         with dr.suspend_grad():
             start = material_at(material, points.uv, valid)
+            side = dr.gather(mi.Float, model.metal, nearest_texel(material, points.uv), valid)
             smooth_n = points.n
             points.n = bent_normal(points, slope_at(material, points.uv, valid))
-            dr.eval(start.base, start.roughness, start.metallic, points.n)
+            dr.eval(start.base, start.roughness, start.metallic, side, points.n)
         lights = sample_lights(mesh, points, start, environment, options.directions, rng)
 
         # opaque: the weight must not become a literal
         colour_smoothing = dr.opaque(mi.Float, options.smooth_colour)
+        few = dr.opaque(mi.Float, float(i < light_steps))
 
         params = [material.colour, material.metallic, light_parameters(model), material.slope]
         dr.enable_grad(*params)
@@ -169,8 +182,8 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         a, b = reflected(points, lights, surface, environment)
         fit = dual_loss(a, b, batch.rgb, valid)
         lit = brightness(batch.rgb, surface.base, valid, options.smooth_shade)
-        prior = material_prior(material, surface, near, valid, options, colour_smoothing * lit) + light_prior(log_light, options)
-        prior += parsimony(material, surface, points.uv, valid, shift, options) + slope_prior(material, bend, close, valid, options)
+        prior = material_prior(material, surface, near, valid, options, colour_smoothing * lit, side) + light_prior(log_light, options)
+        prior += few * parsimony(material, surface, points.uv, valid, shift, options) + slope_prior(material, bend, close, valid, options)
         dr.backward(fit + prior)
         gradients = [dr.grad(p) for p in params]
         dr.disable_grad(*params)
@@ -178,9 +191,9 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         material.colour = adam_colour.step(dr.detach(material.colour), gradients[0], options.colour_rate * decay * warm, ratio)
         material.metallic = adam_metallic.step(dr.detach(material.metallic), gradients[1], options.metallic_rate * decay)
         if gaussians is None:
-            model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * decay)
+            model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * light_decay)
         else:
-            rate = options.light_rate * decay
+            rate = options.light_rate * light_decay
             gaussians.parameters = adam_light.step(dr.detach(gaussians.parameters), gradients[2], rate, gaussians.rates)
             gaussians.project()
             model.log_light = gaussians.log_radiance()
@@ -190,7 +203,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             if i % REFRESH == 0 or i == first:
                 exchange.refresh(environment.image())
             dr.eval(material.colour, model.log_light)
-            rate = options.exchange_rate * decay
+            rate = options.exchange_rate * light_decay
             material.colour, model.log_light = exchange.step(material.colour, model.log_light, gradients[0], gradients[2], rate)
         project(material)
         dr.eval(model.log_light, material.colour, material.metallic, material.slope)
@@ -201,7 +214,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
 
     def state() -> dict:
         names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": light_parameters(model)}
-        return {name: np.array(value) for name, value in names.items()}
+        return {name: np.array(value) for name, value in {**names, "metal": model.metal}.items()}
 
     def textures(uv, valid):
         at = material_at(material, uv, valid)
@@ -266,9 +279,10 @@ def common_scale(surface, valid, power: float = 0.5):
     return mi.Color3f(*[(ALBEDO_START / dr.maximum(weighted_mean(c, w), 1e-3)) ** power for c in surface.base])
 
 
-def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing):
+def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing, side=0.0):
     """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour should share
-    roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float)."""
+    roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float). side: Float, 1 where the surface began as
+    metal, whose E_sparse pulls to 1."""
     other = material_at(material, near.uv, near.valid)
     level = common_scale(surface, valid, options.scale_power)
     step = (other.base - surface.base) * level
@@ -283,7 +297,7 @@ def material_prior(material: MaterialField, surface, near: Points, valid, option
     )
     m = surface.metallic
     white = dr.maximum(mi.Vector3f(surface.base) - WHITE, 0)
-    single = options.metallic_binary * m * (1 - m) + options.metallic_sparse * m + options.bright * dr.squared_norm(white)
+    single = options.metallic_binary * m * (1 - m) + options.metallic_sparse * dr.abs(m - side) + options.bright * dr.squared_norm(white)
     return dr.mean(smooth * w) + dr.mean(dr.select(valid, single, 0))
 
 
@@ -324,4 +338,10 @@ def light_prior(log_light, options: SurfaceOptions):
     soft = lambda c: dr.sqrt(dr.squared_norm(mi.Vector3f(c)) + 1e-4)  # noqa: E731
     grey = (here.x + here.y + here.z) / 3
     chroma = dr.squared_norm(mi.Vector3f(here - grey))
-    return options.light_smooth * dr.mean((soft(right - here) + soft(below - here)) * area) + options.light_neutral * dr.mean(chroma * area)
+    middle = dr.detach(dr.sum(grey * area) / dr.sum(area))
+    even = options.light_even * dr.mean(dr.square(grey - middle) * area)
+    return (
+        even
+        + options.light_smooth * dr.mean((soft(right - here) + soft(below - here)) * area)
+        + options.light_neutral * dr.mean(chroma * area)
+    )

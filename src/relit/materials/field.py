@@ -27,10 +27,10 @@ class MaterialField:
     f0: float = 0.04
 
 
-def start_material(size: int, base: np.ndarray, roughness: float, metallic, f0: float = 0.04) -> MaterialField:
-    """base: (size, size, 3) linear start of the base colour. metallic: a number or (size, size)."""
-    colour = np.concatenate([base, np.full((size, size, 1), roughness)], -1).astype(np.float32)
-    metal = np.broadcast_to(np.asarray(metallic, np.float32), (size, size))
+def start_material(size: int, base: np.ndarray, roughness, metallic, f0: float = 0.04) -> MaterialField:
+    """base: (size, size, 3) linear start of the base colour. roughness, metallic: a number or (size, size)."""
+    rough, metal = (np.broadcast_to(np.asarray(a, np.float32), (size, size)) for a in (roughness, metallic))
+    colour = np.concatenate([base, rough[..., None]], -1).astype(np.float32)
     return MaterialField(size, mi.Float(colour.ravel()), mi.Float(metal.ravel()), dr.zeros(mi.Float, size * size * 2), f0)
 
 
@@ -42,6 +42,13 @@ def texels_at(field: MaterialField, uv):
     fx, fy = x - mi.Float(x0), y - mi.Float(y0)
     i = y0 * s + x0
     return [(i, (1 - fx) * (1 - fy)), (i + 1, fx * (1 - fy)), (i + s, (1 - fx) * fy), (i + s + 1, fx * fy)]
+
+
+def nearest_texel(field: MaterialField, uv):
+    """Flat index (UInt32) of the texel that uv (Point2f) lies in."""
+    s = field.size
+    x, y = (mi.UInt32(dr.clip(c * s, 0, s - 1)) for c in (uv.x, uv.y))
+    return y * s + x
 
 
 def material_at(field: MaterialField, uv, active=True) -> Surface:

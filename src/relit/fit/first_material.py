@@ -1,9 +1,10 @@
-"""Where the object may be metal, before the surface pass begins.
+"""What each place of the object may be made of, before the surface pass begins: metal or paint, glossy or dull.
 
 Metal or not is a choice between two explanations of the same photos: colour that the surface scatters, or colour that it reflects.
-Between them lies a barrier that a descent does not cross: a metal that starts as paint ends as glossy paint under a wrong light. So the
-whole object is fitted twice, shortly and coarsely, from either side, and each group of like colours begins on the side that explains its
-pixels better.
+Between them lies a barrier that a descent does not cross: a metal that starts as paint ends as glossy paint under a wrong light.
+Roughness is much the same: a dull surface that starts glossy keeps its highlights small and pays with the light. So the whole object is
+fitted a few times, shortly and coarsely, from different sides, and each group of like colours begins on the side that explains its pixels
+better.
 """
 
 from __future__ import annotations
@@ -22,33 +23,45 @@ from relit.fit.surface import SurfaceModel, SurfaceOptions, drawn_points, dual_v
 from relit.materials.field import material_at
 from relit.rendering.transport import TraceableMesh, reflected, sample_lights
 
-SIDES = (0.1, 0.5)  # first metallic of the two fits
-GROUPS = 6  # of like colours
-GAIN = 0.13  # the error must fall by this share; from the wrong side it rises, or falls by less than a tenth
-FLOOR = 0.005  # of the error of a pixel: what is explained so well needs no other explanation
-STAYED = 0.4  # mean metallic of a group that is metal, after the short fit
 PAINT, METAL = 0.1, 0.9  # first metallic of the pass itself
+DULL = 0.65  # first roughness of what is explained better so than with the usual first roughness
+SIDES = ((PAINT, None), (0.5, None), (PAINT, DULL))  # first metallic and roughness (None: the options') of the short fits
+GROUPS = 6  # of like colours
+GAIN = 0.13  # metal: the error must fall by this share; from the wrong side it rises, or falls by less than a tenth
+DULL_GAIN = 0.04  # dull: less is enough, since roughness alone is at stake and can still move
+FLOOR = 0.005  # of the error of a pixel: what is explained so well needs no other explanation
+ROSE = 0.54  # mean metallic of a group that is metal, after the short fit from .5
 STEPS = 300  # of each fit, but at most half of those of the pass
 TEXTURE = 128  # texels a side
-TRIAL = {"texture": TEXTURE, "slope_rate": 0.0, "metallic_sparse": 0.003, "metallic_binary": 0.003}
-BATCHES = 4  # of pixels that the fits are judged by
+TRIAL = {"texture": TEXTURE, "light_steps": 0, "slope_rate": 0.0, "metallic_sparse": 0.003, "metallic_binary": 0.003}
+BATCHES = 8  # of pixels that the fits are judged by
 
 
-def metal_start(
+def first_material(
     bank: PixelBank, mesh: TraceableMesh, base: np.ndarray, known: np.ndarray, radiance: float, normals, options: SurfaceOptions, seed=0
-) -> np.ndarray:
-    """(S, S) float32, the metallic to begin with. base, known, radiance, normals: as of `start_surface`."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Metallic and roughness to begin with, (S, S) float32 each. base, known, radiance, normals: as of `start_surface`."""
     o = replace(options, steps=min(STEPS, options.steps // 2), **TRIAL)
     given = (base, known) if normals is None else (base, known, normals)
     small = [cv2.resize(np.asarray(a, np.float32), (TEXTURE, TEXTURE), interpolation=cv2.INTER_AREA) for a in given]
     fits = []
-    for side in SIDES:
-        model = start_surface(small[0], small[1] > 0.5, radiance, o, None if normals is None else small[2], side)
+    for metallic, roughness in SIDES:
+        first = o if roughness is None else replace(o, roughness_start=roughness)
+        model = start_surface(small[0], small[1] > 0.5, radiance, first, None if normals is None else small[2], metallic)
         fits.append(fit_surface(bank, mesh, model, o, NoStage(), seed))
     colour = np.sqrt(np.maximum(base, 0) / max(float(base[known].mean()), 1e-6))
     centres, group = groups_of(colour, known)
-    metal = better_as_metal(*(errors(bank, mesh, f, o, centres, colour, seed) for f in fits))
-    return np.where(metal[group] & known, METAL, PAINT).astype(np.float32)
+    paint, metal, dull = (errors(bank, mesh, f, o, centres, colour, seed) for f in fits)
+    is_metal = better_as_metal(paint, metal) & (metal[:, 0] < dull[:, 0])
+    is_dull = (gain(paint, dull) > DULL_GAIN) & ~is_metal
+    metallic = np.where(is_metal[group] & known, METAL, PAINT)
+    return metallic.astype(np.float32), np.where(is_dull[group] & known, DULL, options.roughness_start).astype(np.float32)
+
+
+def describe(metallic: np.ndarray, roughness: np.ndarray, known: np.ndarray) -> str:
+    """What `first_material` found, as a line for the log."""
+    metal, dull = (f"{part[known].mean():.0%}" for part in (metallic > 0.5, roughness >= DULL))
+    return f"{metal} of the surface begins as metal, {dull} as dull paint"
 
 
 def groups_of(colour: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,6 +94,11 @@ def errors(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, o: Surface
 
 
 def better_as_metal(paint: np.ndarray, metal: np.ndarray) -> np.ndarray:
-    """(G,) bool from the `errors` of the two fits: whether a group is explained clearly better from the metal's side, and stayed there."""
-    gain = (paint[:, 0] - metal[:, 0]) / (paint[:, 0] + FLOOR * paint[:, 2] + 1e-9)
-    return (gain > GAIN) & (metal[:, 1] > STAYED * metal[:, 2])
+    """(G,) bool from the `errors` of the two fits: whether a group is explained clearly better from the metal's side, and has become
+    more of a metal."""
+    return (gain(paint, metal) > GAIN) & (metal[:, 1] > ROSE * metal[:, 2])
+
+
+def gain(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(G,) the share of its error that a group loses with the other of two fits, from their `errors`."""
+    return (one[:, 0] - other[:, 0]) / (one[:, 0] + FLOOR * one[:, 2] + 1e-9)

@@ -1,4 +1,4 @@
-"""Metal or paint: a ball of two materials, one of which reflects its colour and the other scatters it."""
+"""What each place begins as: balls of two materials, metal and paint, glossy and dull."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from relit.capture import open_capture
-from relit.fit import metal
+from relit.fit import first_material as first
 from relit.fit.multiview import MultiviewOptions, reconstruct
 from relit.run import Run
 
@@ -14,8 +14,8 @@ SMALL = MultiviewOptions(levels=(24, 40), level_steps=(60, 60), rays=2048, faces
 SIZE = 64
 
 
-def photographed_ball(out, metallic):
-    """Twenty 64x64 photos of a ball, gold above the equator and red below; metallic: (above, below)."""
+def photographed_ball(out, metallic, roughness):
+    """Twenty 64x64 photos of a ball, gold above the equator and red below; metallic, roughness: (above, below)."""
     import json
 
     import trimesh
@@ -32,10 +32,10 @@ def photographed_ball(out, metallic):
     uvs = np.stack([np.arctan2(n[:, 1], n[:, 0]) / (2 * np.pi) + 0.5, np.arccos(n[:, 2].clip(-1, 1)) / np.pi], -1).astype(np.float32)
     base = np.full((16, 16, 3), (0.8, 0.6, 0.2), np.float32)
     base[8:] = (0.6, 0.1, 0.1)
-    sides = np.repeat(np.array(metallic, np.float32), 8)[:, None] * np.ones(16, np.float32)
+    sides = [np.repeat(np.array(a, np.float32), 8)[:, None] * np.ones(16, np.float32) for a in (roughness, metallic)]
     light = np.full((16, 32, 3), 0.2, np.float32)
     light[2:5, 4:8], light[6:8, 14:16], light[5:9, 24:26] = (9.0, 8.5, 8.0), 12.0, (4.0, 5.0, 6.0)
-    material = Material(base, np.full((2, 2), 0.3, np.float32), sides)
+    material = Material(base, *sides)
     scene = build_scene(Mesh(v, np.asarray(ball.faces, np.int32), n, uvs), material, np.eye(4), light)
     (out / "train").mkdir(parents=True)
     frames, focal = [], 0.5 * SIZE / np.tan(np.radians(20))
@@ -50,25 +50,31 @@ def photographed_ball(out, metallic):
     return out
 
 
-def found(tmp_path, metallic, **options):
-    """Mean metallic that comes out (above the equator, below it)."""
-    capture = open_capture(photographed_ball(tmp_path / "ball", metallic))
+def found(tmp_path, metallic, roughness=(0.3, 0.3), **options):
+    """Mean metallic and roughness that come out, each (above the equator, below it)."""
+    capture = open_capture(photographed_ball(tmp_path / "ball", metallic, roughness))
     with Run.open(tmp_path / "run", {}) as run:
         asset = reconstruct(capture, run, replace(SMALL, **options), 0)
     z = (asset.mesh.vertices @ asset.world_from_asset[:3, :3].T)[:, 2] / np.cbrt(np.linalg.det(asset.world_from_asset[:3, :3]))
     uv = np.clip((asset.mesh.uvs * 64).astype(int), 0, 63)
-    m = asset.material.metallic[uv[:, 1], uv[:, 0]]
-    return m[z > 0.1].mean(), m[z < -0.1].mean()
+    maps = [m[uv[:, 1], uv[:, 0]] for m in (asset.material.metallic, asset.material.roughness)]
+    return [(m[z > 0.1].mean(), m[z < -0.1].mean()) for m in maps]
 
 
 def test_the_metal_half_is_found(tmp_path):
-    above, below = found(tmp_path, (1.0, 0.0))
+    (above, below), _ = found(tmp_path, (1.0, 0.0))
     assert above > 0.6 and below < 0.2, (above, below)
 
 
 def test_paint_stays_paint(tmp_path):
-    above, below = found(tmp_path, (0.0, 0.0))
+    (above, below), _ = found(tmp_path, (0.0, 0.0))
     assert above < 0.15 and below < 0.15, (above, below)
+
+
+def test_dull_paint_is_found_dull(tmp_path):
+    _, (above, below) = found(tmp_path, (0.0, 0.0), (0.7, 0.3))
+    print(above, below)
+    assert above > 0.55 and below < 0.45, (above, below)
 
 
 def test_groups_of_like_colours():
@@ -76,12 +82,12 @@ def test_groups_of_like_colours():
     colour[:, :8], colour[:, 8:] = (0.9, 0.2, 0.2), (0.2, 0.2, 0.9)
     colour += np.random.default_rng(0).normal(0, 0.01, colour.shape).astype(np.float32)
     known = np.ones((16, 16), bool)
-    centres, group = metal.groups_of(colour, known)
-    assert 2 <= len(centres) <= metal.GROUPS
+    centres, group = first.groups_of(colour, known)
+    assert 2 <= len(centres) <= first.GROUPS
     assert not set(group[:, :8].ravel()) & set(group[:, 8:].ravel())
 
 
-@pytest.mark.parametrize("error, metallic, taken", [(0.7, 0.9, True), (0.95, 0.9, False), (0.7, 0.1, False)])
+@pytest.mark.parametrize("error, metallic, taken", [(0.7, 0.6, True), (0.95, 0.6, False), (0.7, 0.5, False)])
 def test_a_group_is_metal_when_that_explains_it_clearly_better(error, metallic, taken):
     paint, other = np.array([[100.0, 10, 100], [50, 5, 100]]), np.array([[100 * error, 100 * metallic, 100], [60, 5, 100]])
-    assert metal.better_as_metal(paint, other).tolist() == [taken, False]
+    assert first.better_as_metal(paint, other).tolist() == [taken, False]
