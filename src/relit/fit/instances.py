@@ -201,17 +201,17 @@ def fit_model(
     model.appearance = shade_world
     model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
     if refine_cameras > 0:
-        move_poses(bank, model)
+        move_poses(bank, model, distances=False)
     options = VolumeOptions((values.shape[0],), (steps,), rays, sharpness=(1.5, 4.0), refine_cameras=refine_cameras, hold=hold)
     fit_volume(bank, model, options, NoStage(), seed)
     return model, moved_poses(bank, views, poses)
 
 
-def move_poses(bank: PixelBank, model: VolumeModel) -> None:
+def move_poses(bank: PixelBank, model: VolumeModel, distances: bool = True) -> None:
     """Let the volume pass turn the cameras about the object's middle (not about themselves, which would throw the picture aside), move
-    them, and change their distance; the focal length stays."""
+    them, and change their distance, if asked to; the focal length stays."""
     bank.corrections = dr.zeros(mi.Float, 8 * bank.views)
-    model.extra["correction_rates"] = mi.Float(np.tile(np.array([1, 1, 1, 1, 1, 1, 0, 1], np.float32), bank.views))
+    model.extra["correction_rates"] = mi.Float(np.tile(np.array([1, 1, 1, 1, 1, 1, 0, distances], np.float32), bank.views))
 
 
 def moved_poses(bank: PixelBank, views: list[View], poses: np.ndarray) -> np.ndarray:

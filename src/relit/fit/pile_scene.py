@@ -19,6 +19,7 @@ from relit.scene import Camera, Ground, Mesh
 TOUCHES = 0.08  # unit lengths within which an instance counts as touching the ground
 SETTLED = 4  # instances that must touch the ground before their distances follow it
 FARTHEST = 0.02  # of its distance that an instance is moved at most
+BESIDE = 0.005  # the same for what is moved onto another instance, or from farther above the ground: that it rests there is a guess
 TILT = 5.0  # degrees that the ground may turn meanwhile
 STEEP = 0.3  # sine of the angle at which the photo must look down on the ground for objects to be moved onto something
 GROUND_ROWS = 96
@@ -77,10 +78,10 @@ def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray, distanc
     for k in np.argsort(gaps):
         ray = standing[k][:3, 3]
         if -(ray @ up) > STEEP * np.linalg.norm(ray):
-            share = gaps[k] / -(ray @ up)  # of the distance: the object's middle moves by share * ray
+            share, most = gaps[k] / -(ray @ up), FARTHEST  # of the distance: the object's middle moves by share * ray
             if gaps[k] > TOUCHES:
-                share = resting_share(points, standing, k, placed, distance, share)
-            if abs(share) < FARTHEST:
+                share, most = resting_share(points, standing, k, placed, distance, share), BESIDE
+            if abs(share) < most:
                 standing[k][:3, 3] += share * ray
                 count += 1
         placed.append(k)
