@@ -27,7 +27,7 @@ from relit.fit.duplicates_options import DuplicatesOptions, options_for
 from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.instance_search import Search
-from relit.fit.instances import ANOTHER_PHOTO, View, carved, move_poses, moved_poses, pixel_bank
+from relit.fit.instances import ANOTHER_PHOTO, View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
@@ -118,9 +118,8 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
         rate = 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
         if rate > 0:
             move_poses(bank, model)
-        fit_volume(
-            bank, model, VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=HOLD), stage, seed
-        )
+        o = VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=HOLD)
+        fit_volume(bank, model, o, stage, seed, hold_distances if rate > 0 else None)
     poses = moved_poses(bank, views, poses)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         mesh, how = unwrap(extract_mesh(dense_values(model.grid), faces=options.faces), options.texture)

@@ -214,6 +214,14 @@ def move_poses(bank: PixelBank, model: VolumeModel, distances: bool = True) -> N
     model.extra["correction_rates"] = mi.Float(np.tile(np.array([1, 1, 1, 1, 1, 1, 0, distances], np.float32), bank.views))
 
 
+def hold_distances(model: VolumeModel) -> None:
+    """Change the distances of `move_poses` no more. What they have to mend is large, and done on a coarse grid; on a fine one their steps
+    shake the size of every instance, and turns suffer."""
+    rates = np.array(model.extra["correction_rates"]).reshape(-1, 8)
+    rates[:, 7] = 0
+    model.extra["correction_rates"] = mi.Float(rates.ravel())
+
+
 def moved_poses(bank: PixelBank, views: list[View], poses: np.ndarray) -> np.ndarray:
     """The poses (N, 4, 4) with the corrections that a fit has found."""
     cameras = corrected([v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)], np.array(bank.corrections))
