@@ -112,6 +112,17 @@ def test_a_stray_camera_does_not_move_the_sphere():
     np.testing.assert_allclose(s.sphere_from_rays([stray, *cameras[1:]]).centre, 0, atol=0.15)
 
 
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("value", [1e30, 1e200, np.inf, np.nan])
+def test_a_pose_with_senseless_numbers_is_no_crash(value):
+    origins = np.random.default_rng(0).normal(size=(4, 3))
+    for which in range(2):
+        rays = [origins.copy(), -origins]
+        rays[which][0, 0] = value
+        assert s.robust_closest_point(*rays).shape == (3,)
+    assert s.robust_closest_point(np.zeros((4, 3)), np.zeros((4, 3))).shape == (3,)  # and so is one without a direction
+
+
 def test_cameras_that_look_outwards():
     cameras = [c.with_pose(look_at(c.centre, 2 * c.centre)) for c in shots.ring()]
     with pytest.raises(UserError, match="look away from each other"):

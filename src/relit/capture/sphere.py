@@ -45,13 +45,17 @@ def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sp
 
 
 def closest_point(origins: np.ndarray, directions: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """The point (3,) with the least sum of squared distances to rays (N, 3), (N, 3); damped towards the mean origin for parallel rays."""
+    """The point (3,) with the least sum of squared distances to rays (N, 3), (N, 3); damped towards the mean origin for parallel rays, and
+    that origin where numbers are too large to tell."""
     d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
     across = across * (np.ones(len(d)) if weights is None else weights)[:, None, None]
     a, b = across.sum(0), (across @ origins[:, :, None]).sum(0)[:, 0]
     damping = 1e-9 * np.trace(a)
-    return np.linalg.solve(a + damping * np.eye(3), b + damping * origins.mean(0))
+    a, b = a + damping * np.eye(3), b + damping * origins.mean(0)
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return origins.mean(0)
+    return np.linalg.lstsq(a, b, rcond=None)[0]
 
 
 def robust_closest_point(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
