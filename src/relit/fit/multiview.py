@@ -115,6 +115,7 @@ PRESETS = {
         "texture": 1024,
         "surface_steps": 6000,
         "light_steps": 1600,
+        "points": 8192,
     },
 }
 
