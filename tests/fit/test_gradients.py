@@ -121,7 +121,7 @@ class SurfaceScene:
 
     def __init__(self):
         rng = np.random.default_rng(1)
-        self.options = SurfaceOptions(texture=8, light=6, smooth_colour=0.2)
+        self.options = SurfaceOptions(texture=8, light=6, smooth_colour=0.2, light_even=0.02)
         mesh, _ = lump()
         self.mesh = TraceableMesh(mesh, rng.uniform(0.1, 0.6, mesh.vertices.shape))
         self.field = start_material(8, rng.uniform(0.1, 0.8, (8, 8, 3)), 0.45, 0.3)
@@ -165,7 +165,8 @@ class SurfaceScene:
         surface, environment = self.place(x)
         a, b = reflected(self.points, self.lights, surface, environment)
         fit = dual_loss(a, b, self.target, self.valid)
-        prior = material_prior(self.field, surface, self.near, self.valid, self.options, mi.Float(self.options.smooth_colour))
+        side = mi.Float(dr.arange(mi.UInt32, dr.width(self.valid)) % 2)  # every other point began as metal
+        prior = material_prior(self.field, surface, self.near, self.valid, self.options, mi.Float(self.options.smooth_colour), side)
         bend = self.bend.x * self.points.t + self.bend.y * self.points.b
         prior += slope_prior(self.field, bend, self.close, self.valid, self.options)
         prior += parsimony(self.field, surface, self.points.uv, self.valid, mi.UInt32(7), self.options)

@@ -13,7 +13,18 @@ from relit.conventions import similarity
 from relit.fit.instance_growth import Growth, grow, linked_poses
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_search import APART, Guesses, Search, ambiguous, crops_of, first_pairs, place, reconsider, trusted
-from relit.fit.instances import albedo_render, carved, first_pose, fit_model, frame_scale, inflated, pixel_bank, views_of
+from relit.fit.instances import (
+    albedo_render,
+    carved,
+    first_pose,
+    fit_model,
+    frame_scale,
+    hold_distances,
+    inflated,
+    move_poses,
+    pixel_bank,
+    views_of,
+)
 from relit.fit.pile_scene import find_ground
 from relit.fit.register import crop_rings, directions_around, make_gallery, search, views_from
 from relit.geometry.sdf import node_positions
@@ -230,6 +241,17 @@ def test_poses_of_a_ball_are_ambiguous_and_those_of_a_painted_body_are_not():
     assert (ambiguous(views, truth, o) == 0).all()
     plain, poses = painted([0, 25, 50], axes=(0.5, 0.5, 0.5), contrast=0.0)
     assert (ambiguous(plain, poses, o) >= APART).all()
+
+
+def test_distances_are_held_once_asked_to_and_nothing_else_is():
+    from types import SimpleNamespace
+
+    bank, model = SimpleNamespace(views=3), SimpleNamespace(extra={})
+    move_poses(bank, model)
+    before = np.array(model.extra["correction_rates"]).reshape(3, 8)
+    hold_distances(model)
+    after = np.array(model.extra["correction_rates"]).reshape(3, 8)
+    assert (before[:, 7] == 1).all() and (after[:, 7] == 0).all() and (before[:, :7] == after[:, :7]).all()
 
 
 def test_instances_with_low_scores_are_not_trusted():

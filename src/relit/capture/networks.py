@@ -54,7 +54,6 @@ class Network:
         return UserError(f"the network's output is {' x '.join(map(str, out.shape))}", f"{wanted} is looked for", f"see: {self.path}")
 
 
-
 def first_line(error: Exception) -> str:
     return str(error).strip().splitlines()[0][:200]
 

@@ -122,7 +122,8 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
         fit_volume(bank, model, o, stage, seed, hold_distances if rate > 0 else None)
     poses = moved_poses(bank, views, poses)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
-        mesh, how = unwrap(extract_mesh(dense_values(model.grid), faces=options.faces), options.texture)
+        values = dense_values(model.grid)
+        mesh, how = unwrap(extract_mesh(values, faces=options.faces), options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
         rows = row_features(model.grid)
@@ -138,7 +139,7 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
         poses = np.linalg.inv(scene.standing)
         plane = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, poses)
         if len(plane) and rate > 0 and len(scene.motions) == 1:
-            poses, plane, count = set_down(mesh.vertices, poses, plane, distance_in(dense_values(model.grid)))
+            poses, plane, count = set_down(mesh.vertices, poses, plane, distance_in(values))
             if count:
                 run.say(f"{count} instances were moved along their lines of sight onto the ground, or onto what they rest on")
         if len(plane) == 0:

@@ -52,8 +52,7 @@ def first_material(
     colour = np.sqrt(np.maximum(base, 0) / max(float(base[known].mean()), 1e-6))
     centres, group = groups_of(colour, known)
     paint, metal, dull = (errors(bank, mesh, f, o, centres, colour, seed) for f in fits)
-    is_metal = better_as_metal(paint, metal) & (metal[:, 0] < dull[:, 0])
-    is_dull = (gain(paint, dull) > DULL_GAIN) & ~is_metal
+    is_metal, is_dull = explained_better(paint, metal, dull)
     metallic = np.where(is_metal[group] & known, METAL, PAINT)
     return metallic.astype(np.float32), np.where(is_dull[group] & known, DULL, options.roughness_start).astype(np.float32)
 
@@ -93,10 +92,11 @@ def errors(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, o: Surface
     return out
 
 
-def better_as_metal(paint: np.ndarray, metal: np.ndarray) -> np.ndarray:
-    """(G,) bool from the `errors` of the two fits: whether a group is explained clearly better from the metal's side, and has become
-    more of a metal."""
-    return (gain(paint, metal) > GAIN) & (metal[:, 1] > ROSE * metal[:, 2])
+def explained_better(paint: np.ndarray, metal: np.ndarray, dull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which groups are metal and which are dull paint, (G,) bool each, from the `errors` of the three fits. Metal: explained clearly better
+    from that side, and become more of a metal; dull: explained better so, and no metal."""
+    is_metal = (gain(paint, metal) > GAIN) & (metal[:, 1] > ROSE * metal[:, 2]) & (metal[:, 0] < dull[:, 0])
+    return is_metal, (gain(paint, dull) > DULL_GAIN) & ~is_metal
 
 
 def gain(one: np.ndarray, other: np.ndarray) -> np.ndarray:

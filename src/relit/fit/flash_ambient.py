@@ -9,7 +9,7 @@ taken for diffuse. The exact term is that of the surface pass (rendering/transpo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -124,6 +124,4 @@ def exchange(mesh: TraceableMesh, x: np.ndarray, n: np.ndarray, tree) -> csr_mat
 
 def with_any_uvs(mesh: Mesh) -> Mesh:
     """The mesh with texture coordinates of some kind, which ray queries ask for."""
-    from dataclasses import replace
-
     return mesh if mesh.uvs is not None else replace(mesh, uvs=np.zeros((len(mesh.vertices), 2), np.float32))

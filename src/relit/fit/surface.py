@@ -144,7 +144,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     exchange = Exchange(model.normals, material.size**2, options.light, options.exchange_rows)
     adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, light_parameters(model)))
     adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
-    light_steps = options.light_steps or options.steps
+    light_steps = min(options.light_steps or options.steps, options.steps)
     ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
     ratio = mi.Float(ratio)
 
@@ -199,7 +199,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             model.log_light = gaussians.log_radiance()
         slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
         material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
-        if options.exchange_rate > 0 and gaussians is None:
+        if options.exchange_rate > 0 and gaussians is None and i < light_steps:
             if i % REFRESH == 0 or i == first:
                 exchange.refresh(environment.image())
             dr.eval(material.colour, model.log_light)
