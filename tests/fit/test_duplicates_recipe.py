@@ -14,8 +14,8 @@ from relit.asset.gltf import write_glb
 from relit.cameras.se3 import rotation_angle
 from relit.capture import open_capture
 from relit.capture.procedural import pawn
-from relit.capture.synthetic_duplicates import heap, synthesize_duplicates
-from relit.conventions import scale_of, similarity
+from relit.capture.synthetic_duplicates import RADIUS, heap, synthesize_duplicates
+from relit.conventions import move_points, scale_of, similarity
 from relit.errors import UserError
 from relit.evaluate.protocols import evaluate
 from relit.fit import duplicates as recipe
@@ -72,11 +72,19 @@ def test_objects_of_a_heap_stand_on_the_ground_and_hardly_in_one_another():
     poses, reach = heap(mesh, 6, 0, 12.0, 1.0)
     again, _ = heap(mesh, 6, 0, 12.0, 1.0)
     assert np.allclose(poses, again)
-    from relit.conventions import move_points
-
     lowest = [move_points(p, mesh.vertices)[:, 1].min() for p in poses]
     assert min(lowest) == pytest.approx(0, abs=0.1) and min(lowest) > -0.05
     assert all(np.linalg.norm(p[[0, 2], 3]) < reach + 1.0 for p in poses)
+
+
+def test_objects_of_a_heap_lie_on_one_another():
+    from scipy.spatial import cKDTree
+
+    mesh, _ = pawn(rows=40, columns=60, texture=32)
+    poses, _ = heap(mesh, 5, 1, 12.0, 0.1)  # all at one place
+    placed = [move_points(p, mesh.vertices) for p in poses]
+    gaps = [min(cKDTree(q).query(p)[0].min() for q in placed[:k]) for k, p in enumerate(placed) if p[:, 1].min() > 0.1]
+    assert len(gaps) >= 3 and max(gaps) < 0.06 * RADIUS  # a tenth and more on a height field of a third of the detail
 
 
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):

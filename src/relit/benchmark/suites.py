@@ -157,7 +157,7 @@ DUPLICATES = Suite(
         Item("spot-60", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 60, **SPOT_MATERIAL}),
     ),
     relights=("envmaps/adams_place_bridge_1k.hdr", "envmaps/forest_slope_1k.hdr"),
-    options={"test_views": 8, "resolution": 1600, "test_resolution": 400, "spp": 64, "test_spp": 64, "seed": 0},
+    options={"test_views": 8, "resolution": 1600, "test_resolution": 400, "spp": 64, "test_spp": 128, "seed": 0},
     synthesize="relit.capture.synthetic_duplicates.synthesize_duplicates",
     evaluate="relit.evaluate.duplicates.evaluate_duplicates",
     bars={

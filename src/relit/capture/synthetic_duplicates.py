@@ -27,12 +27,12 @@ from relit.conventions import move_points, similarity, world_from_gl_camera
 from relit.errors import UserError
 from relit.scene import Camera, Ground, Mesh
 
-VERSION = 1
+VERSION = 2
 FOV = 38.0  # degrees, the shorter side of the photo
 ELEVATION = 55.0  # degrees, of the photo's camera
 STEP = 35.0  # degrees around the pile from one photo to the next
 TEST_ELEVATIONS = (38.0, 58.0)  # of the novel views, in turn
-CELL = RADIUS / 20  # of the height field that objects drop onto
+CELL = RADIUS / 60  # of the height field that objects drop onto: they come to rest a cell or two above one another
 GROUND_COLOUR, GROUND_ROUGHNESS = (0.36, 0.33, 0.30), 0.8
 
 
@@ -48,7 +48,7 @@ def synthesize_duplicates(
     resolution: int = 1600,
     test_resolution: int = 400,
     spp: int = 64,
-    test_spp: int = 64,
+    test_spp: int = 128,
     seed: int = 0,
     lean: float = 12.0,
     spread: float = 1.0,
@@ -217,7 +217,7 @@ def grown(height: np.ndarray) -> np.ndarray:
     return cv2.dilate(height, np.ones((3, 3)))
 
 
-def surface_points(vertices: np.ndarray, faces: np.ndarray, rng, count: int = 30_000) -> np.ndarray:
+def surface_points(vertices: np.ndarray, faces: np.ndarray, rng, count: int = 60_000) -> np.ndarray:
     """Vertices and random points on the faces, (M, 3)."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

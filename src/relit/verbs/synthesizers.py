@@ -167,7 +167,7 @@ def duplicates_flags(parser: Parser) -> None:
     more("--resolution", type=int, default=1600, help="pixels a side of the photo (default 1600)")
     more("--test-resolution", type=int, default=400, help="pixels a side of the novel views (default 400)")
     more("--spp", type=int, default=64, help="samples a pixel of the photo (default 64)")
-    more("--test-spp", type=int, default=64, help="samples a pixel of what is measured against (default 64)")
+    more("--test-spp", type=int, default=128, help="samples a pixel of what is measured against (default 128)")
     more(
         "--lean", type=float, default=12.0, metavar="DEGREES", help="standard deviation of the tilt away from the resting pose (default 12)"
     )
