@@ -8,7 +8,7 @@ from test_flash_dino import write_network
 
 from relit.fit.flash_dino import DinoNetwork
 from relit.fit.flash_features import FlashView, capture_features, network_features, seen_from
-from relit.fit.kinship import LADDER, best_lobes, start_kinship
+from relit.fit.kinship import LADDER, best_lobes, highlights_seen, pooled, start_kinship
 from relit.materials.plastic_field import plastic_at
 from relit.materials.rough_plastic import Coat
 
@@ -95,3 +95,34 @@ def test_the_best_lobe_is_that_of_the_photo():
     specular, alpha, factor, shift = best_lobes(sums, np.array([[0.02, 0.3]]))[0]
     assert alpha == pytest.approx(0.21, rel=0.05) and specular == pytest.approx(0.02, rel=0.1)
     assert factor == pytest.approx(1.1, abs=0.02) and shift == pytest.approx(-0.03, abs=0.01)
+
+
+def test_a_group_that_shows_no_highlight_takes_the_lobe_of_the_likest():
+    """Two paints seen from all sides, and the underside of the first, seen at grazing angles alone and with a falloff that is wrong."""
+    rng = np.random.default_rng(4)
+    features = np.repeat([[0.2, 0.0], [0.8, 0.0], [0.2, 0.12]], 100, axis=0).reshape(1, 300, 2) + rng.normal(0, 1e-4, (1, 300, 2))
+    kin = start_kinship(features, np.ones((1, 300), bool), np.full((1, 300, 2), 0.3), groups=4)
+    nearest = np.array(kin.index).reshape(300, 4)[:, 0]
+    lobe = lambda a, t: np.exp(-((np.tan(t) / a) ** 2)) / a**2 * 0.01  # noqa: E731
+    fall = lambda a, t: np.cos(t) ** (1 + 2 * a)  # noqa: E731
+    for group in np.unique(nearest):
+        paint = np.flatnonzero(nearest == group)[0] // 100
+        low, high = (0, 1.2) if paint < 2 else (1.0, 1.4)
+        angle = rng.uniform(low, high, 3000)
+        alpha, specular = ((0.2, 0.8), (0.4, 0.3), (0.2, 0.8))[paint]
+        base = rng.uniform(0.3, 0.7, 3000)
+        photo = specular * lobe(alpha, angle) + base * fall(alpha if paint < 2 else 0.7, angle)
+        for k, a in enumerate(LADDER):
+            columns = np.stack([lobe(a, angle), base * fall(a, angle), fall(a, angle), photo])
+            kin.sums[k, group] = columns @ columns.T
+    kin.trust = highlights_seen(kin.sums)
+    top, other, under = nearest[0], nearest[150], nearest[-1]
+    assert kin.trust[top] == 1 and kin.trust[other] == 1 and kin.trust[under] == 0
+    start = np.tile([0.5, 0.3], (4, 1))
+    found = best_lobes(pooled(kin), start)
+    assert found[top, 1] == pytest.approx(0.2, rel=0.1) and found[other, 1] == pytest.approx(0.4, rel=0.1)
+    np.testing.assert_allclose(found[under, :2], found[top, :2], rtol=0.02)
+    alone = best_lobes(kin.sums, start)  # what it would take from itself
+    assert alone[under, 1] > 0.5
+    kept = np.array(kin.own(0.99)).reshape(300, 2)
+    assert kept[:100].min() > 0.95 and kept[-100:].max() < 0.9

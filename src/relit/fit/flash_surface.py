@@ -160,8 +160,8 @@ def fit_flash_surface(
         )
         if model.kinship is not None:
             with dr.suspend_grad():
-                keep = dr.opaque(mi.Float, 1 - (1 - o.own) * decay)
                 common = model.kinship.spread(model.kinship.level)
+                keep = 1 - (1 - model.kinship.own(o.own)) * dr.opaque(mi.Float, decay)
                 field.lobe = common + keep * (field.lobe - common)
                 if i % (o.share_every if 20 * i > o.steps else 2) == 0:
                     share(i, points, batch, plastic, n, position, intensity, seen, (a + b) * 0.5 - straight, calm, sigma, decay)

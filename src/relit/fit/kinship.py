@@ -9,6 +9,9 @@ stop in between, the diffuse albedo of every texel having settled on what the wr
 for: for each width of the lobe on a ladder, the specular albedo and a factor and a grey shift of the diffuse albedo are a linear
 least-squares problem; the width with the least error is taken. The diffuse albedo is here the one that the capture tells before
 any fit: the noise of a texture in the middle of its fit would weaken its column, and a broad lobe would take its place.
+
+A group that no photo shows near the mirror direction, such as an underside, has no say, not even over itself: what a lobe changes there is
+how the diffuse light falls off towards grazing angles, and errors of the shape change that more. It takes what the likest groups know.
 """
 
 from __future__ import annotations
@@ -28,6 +31,11 @@ NEAREST = 4  # groups of a texel
 LADDER = np.geomspace(0.04, 0.75, 18)  # widths alpha that are tried
 COLUMNS = 4  # lobe of a specular albedo of 1, diffuse light as it is, diffuse light of an albedo of 1, photo
 FORGET = 0.8  # of the running sums per call
+SEEN = (0.008, 0.02)  # strength of a narrow lobe over a white base, root mean square, where a group's evidence begins and is whole
+NARROW = 6  # rung of the ladder, alpha .11, that this is asked of
+FAR = 1e-3  # weight of the evidence of groups that are less alike
+UNSEEN_OWN = 0.8  # part of what a texel has to itself that is kept per step where no highlight is seen
+LEAST = 1e-4  # evidence below this part of the mean group's tells nothing
 PRIOR = (1e-4, 1e-5, 1e-5)  # belief in no change of specular albedo, factor and shift, against the evidence of the mean group
 
 
@@ -35,6 +43,7 @@ PRIOR = (1e-4, 1e-5, 1e-5)  # belief in no change of specular albedo, factor and
 class Kinship:
     """groups: their number. index: UInt32 [texels * NEAREST]. weight: Float [texels * NEAREST], summing to 1 for each texel. level: Float
     [groups * 2], specular albedo and alpha of each group. alike: (groups, groups), how far one's evidence counts for another.
+    trust: (groups,), how far a group's own evidence counts, 0 to 1.
     sums: (LADDER, groups, COLUMNS, COLUMNS), running weighted sums of products of `share_evidence`'s columns."""
 
     groups: int
@@ -43,6 +52,7 @@ class Kinship:
     level: Any
     alike: np.ndarray
     sums: np.ndarray
+    trust: np.ndarray
 
     def spread(self, values, channels: int = 2):
         """Float [groups * channels] -> Float [texels * channels]."""
@@ -54,6 +64,11 @@ class Kinship:
             group = dr.gather(mi.UInt32, self.index, at)
             out = dr.fma(dr.gather(mi.Float, self.weight, at), dr.gather(mi.Float, values, group * channels + channel), out)
         return out
+
+    def own(self, usual: float):
+        """Float [texels * 2]: part of what a texel has to itself that is kept per step; `usual` where highlights are seen."""
+        per_group = UNSEEN_OWN + (usual - UNSEEN_OWN) * self.trust
+        return self.spread(mi.Float(np.repeat(per_group, 2).astype(np.float32)))
 
 
 def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, groups: int = 40, width: float = 0.08) -> Kinship:
@@ -71,14 +86,16 @@ def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, gro
     weight = np.exp((distance[:, :1] ** 2 - distance**2) / (2 * width**2))
     weight /= weight.sum(1, keepdims=True)
     level = np.tile(np.median(lobe[known], axis=0), (groups, 1))
+    apart = np.square(centres[:, None] - centres[None]).sum(-1)
     numbers = lambda a: mi.Float(np.ascontiguousarray(a, np.float32).ravel())  # noqa: E731
     return Kinship(
         groups,
         mi.UInt32(index.astype(np.uint32).ravel()),
         numbers(weight),
         numbers(level),
-        np.exp(-np.square(centres[:, None] - centres[None]).sum(-1) / (2 * (width / 2) ** 2)),
+        np.exp(-apart / (2 * (width / 2) ** 2)) + FAR * np.exp(-apart / (2 * (2 * width) ** 2)),
         np.zeros((len(LADDER), groups, COLUMNS, COLUMNS)),
+        np.ones(groups),
     )
 
 
@@ -109,11 +126,27 @@ def share_evidence(kin: Kinship, field: PlasticField, uv, plastic: Plastic, shad
     keep = FORGET if kin.sums.any() else 0.0
     kin.sums = keep * kin.sums + (1 - keep) * now
     level = np.array(kin.level).reshape(-1, 2)
-    best = best_lobes(np.einsum("gh,lhij->lgij", kin.alike, kin.sums), level)
+    kin.trust = highlights_seen(kin.sums)
+    best = best_lobes(pooled(kin), level)
     change = mi.Float((rate * (best[:, :2] - level)).astype(np.float32).ravel())
     kin.level = kin.level + change
     field.lobe = field.lobe + kin.spread(change)
     dr.eval(kin.level, field.lobe)
+
+
+def highlights_seen(sums: np.ndarray) -> np.ndarray:
+    """(groups,) 0 to 1: how far the photos look at each group near the mirror direction, where its lobe would show."""
+    lobe, white = sums[NARROW, :, 0, 0], sums[NARROW, :, 2, 2]
+    strength = np.sqrt(lobe / np.maximum(white, 1e-12))
+    return np.clip((strength - SEEN[0]) / (SEEN[1] - SEEN[0]), 0, 1) * (white > 0)
+
+
+def pooled(kin: Kinship) -> np.ndarray:
+    """(LADDER, groups, COLUMNS, COLUMNS): what each group's lobe is judged by, the trusted evidence of all groups as far as they are alike.
+    The likest counts whole."""
+    weight = kin.alike * kin.trust
+    weight /= np.maximum(weight.max(1, keepdims=True), 1e-9)
+    return np.einsum("gh,lhij->lgij", weight, kin.sums)
 
 
 def best_lobes(sums: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -135,6 +168,7 @@ def best_lobes(sums: np.ndarray, level: np.ndarray) -> np.ndarray:
     t = np.clip(0.5 * (a - c) / np.maximum(a - 2 * b + c, 1e-12), -1, 1)[:, None]  # the parabola through three rungs of log alpha
     blend = np.where(t < 0, (1 + t) * found[k, g] - t * found[k - 1, g], (1 - t) * found[k, g] + t * found[k + 1, g])
     alpha = LADDER[k] * (LADDER[1] / LADDER[0]) ** t[:, 0]
-    known = np.einsum("lgii->g", sums[..., :3, :3]) > 0.02 * np.einsum("lgii->g", sums[..., :3, :3]).mean()
+    evidence = np.einsum("lgii->g", sums[..., :3, :3])
+    known = evidence > LEAST * evidence.mean()
     out = np.stack([np.clip(blend[:, 0], 0, 2), alpha, np.clip(blend[:, 1], 0.7, 1.4), np.clip(blend[:, 2], -0.1, 0.1)], 1)
     return np.where(known[:, None], out, np.stack([*level.T, prior[:, 1], prior[:, 2]], 1))
