@@ -11,6 +11,7 @@ import pytest
 from relit.errors import UserError
 from relit.fit import flash
 from relit.fit.pixels import make_bank
+from relit.rendering.shade_flash import start_learnt
 from relit.scene import Capture, Photo, Sphere
 
 
@@ -75,6 +76,12 @@ def test_parts_that_are_switched_off(part, name, value):
     full, less = (flash.surface_options(flash.FlashOptions(without=w), 0.99) for w in ((), (part,)))
     assert getattr(full, name) != value and getattr(less, name) == value
     assert replace(full, **{name: value}) == less
+
+
+def test_the_flash_is_held_until_the_shape_stands(device):
+    rates = flash.rates_by_step(start_learnt()[1], 30)
+    early, late = np.array(rates(29)), np.array(rates(30))
+    assert (early[:3] == 0).all() and (late[:3] > 0).all() and (early[3:] == late[3:]).all()
 
 
 def test_only_photos_that_clip_can_be_over_exposed():

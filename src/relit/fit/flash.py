@@ -13,6 +13,7 @@ settle: it is set so that the brightest diffuse albedo is BRIGHTEST.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
@@ -46,6 +47,7 @@ STAGES = ("volume", "mesh", "surface")
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
 COARSE_FACES = 20_000  # of the mesh on which the volume pass's inter-reflection is estimated
 PLACE = 0.15  # how much a unit length counts beside a display value when places are compared
+HELD = 0.25  # of the last level's steps in which the flash still stands at the camera: before the shape, it runs past its place
 START_ALBEDO, MEAN_COSINE, START_WIDTH = 0.4, 0.7, 0.2
 
 
@@ -194,6 +196,7 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
     distance2 = float(np.median([c.centre @ c.centre for c in cameras]))
     intensity = np.pi * distance2 * float(level.mean()) / (START_ALBEDO * MEAN_COSINE)
     shadows = options.shadows and "shadow" not in options.without
+    free = np.inf if "offset" in options.without else sum(options.level_steps) - (1 - HELD) * options.level_steps[-1]
     with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
         try:
             values = visual_hull(cameras, masks, options.levels[0])
@@ -207,11 +210,8 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
 
         def start(values: np.ndarray, full: bool) -> VolumeModel:
             model = start_model(values, START_ALBEDO * level / level.mean(), None, full=full)
-            model.reflections, model.rates = start_learnt()
-            if "offset" in options.without:
-                rates = np.array(model.rates)
-                rates[:3] = 0
-                model.rates = mi.Float(rates)
+            model.reflections, rates = start_learnt()
+            model.rates = rates_by_step(rates, 0 if full and "offset" not in options.without else free)
             appearance = FlashAppearance(coat, intensity, options.levels[-1] if shadows else np.inf)
             model.appearance, appearance.model = appearance, model
             model.extra["intensity"] = intensity
@@ -229,6 +229,14 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
         offset = np.array(model.reflections)[:3]
         run.say(f"flash after the volume pass: offset {offset.round(4).tolist()} of the object sphere's radius")
     return model
+
+
+def rates_by_step(rates, free: float) -> Callable:
+    """Step -> `rates` (Float), those of the flash's offset 0 before the step `free`."""
+    held = np.array(rates)
+    held[:3] = 0
+    held = mi.Float(held)
+    return lambda i: rates if i >= free else held
 
 
 def look_around(bank: PixelBank, cameras: list[Camera], model: VolumeModel, coat: Coat) -> None:

@@ -70,7 +70,7 @@ class VolumeModel:
 
     appearance: another deferred appearance than rendering/shade.py's, called as f(marched, rays, cameras, reflections) -> (radiance
     Color3f premultiplied with opacity, unit normal Vector3f); `reflections` is then whatever flat Float it learns, each entry
-    with its own rate, `rates` (Float, times 0.06)."""
+    with its own rate, `rates` (Float, or a function of the step that gives it; times 0.06)."""
 
     grid: SdfGrid
     reflections: Any
@@ -205,7 +205,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         moved = adam["sdf"].step(dr.detach(grid.row_values), gradients[0], options.sdf_rate * h * decay)
         grid.row_values = moved - kappa * neighbour_mean_difference(grid, diffusion)
         grid.features = adam["features"].step(dr.detach(grid.features), gradients[1], options.feature_rate * decay)
-        model.reflections = adam["reflections"].step(dr.detach(model.reflections), gradients[2], 0.06 * decay, model.rates)
+        rates = model.rates(i) if callable(model.rates) else model.rates
+        model.reflections = adam["reflections"].step(dr.detach(model.reflections), gradients[2], 0.06 * decay, rates)
         if model.background is not None:
             model.background.cells = adam["background"].step(dr.detach(model.background.cells), gradients[3], 0.05 * decay)
         if refine:
