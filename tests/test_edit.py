@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from cv2 import imwrite as cv_write
 
 from relit.asset.asset import load_asset, save_asset
 from relit.cameras.se3 import look_at
@@ -13,7 +16,7 @@ from relit.edit import edit, insert
 from relit.errors import UserError
 from relit.images import read_image, write_srgb
 from relit.rendering.mitsuba_scene import build_scene, render
-from relit.rendering.pile import build_pile
+from relit.rendering.pile import build_pile, instance_ids
 from relit.scene import Asset, Camera, Ground, Instance
 
 
@@ -58,6 +61,26 @@ def test_a_removed_instance_leaves_ground_without_its_shadow(run, tmp_path):
         edit(folder, tmp_path / "none", remove=[30])
     with pytest.raises(UserError, match="nothing would be left"):
         edit(folder, tmp_path / "none", remove=[10, 20])
+
+
+@pytest.mark.parametrize("labels", [False, True])
+def test_no_rim_of_a_removed_instance_stays_where_the_model_is_too_small(run, tmp_path, labels):
+    folder, photo = run
+    asset = load_asset(folder)
+    thin = replace(asset.mesh, vertices=(asset.mesh.vertices * np.float32([0.6 if labels else 0.85, 1, 1])).astype(np.float32))
+    poses = [i.world_from_object for i in asset.instances]
+    true = build_pile(asset.mesh, asset.material, poses, asset.ground)
+    ids = instance_ids(build_scene(true.mesh, true.material, np.eye(4), asset.environment), true, asset.cameras[0][1])
+    save_asset(tmp_path / "thin", replace(asset, mesh=thin))
+    write_srgb(tmp_path / "photo.png", read_image(photo).rgb)
+    if labels:
+        cv_write(str(tmp_path / "photo_labels.png"), np.array([10, 20, 0], np.uint8)[ids])
+    edit(tmp_path / "thin", tmp_path / "one", photo=tmp_path / "photo.png", remove=[20], spp=32)
+    after = read_image(tmp_path / "one" / "photo.png").rgb
+    left = np.ptp(after, axis=-1)[ids == 1]  # the ground is grey, the object is not
+    assert np.ptp(read_image(photo).rgb, axis=-1)[ids == 1].max() > 0.2 and left.max() < 0.1
+    kept = ids == 0
+    assert np.abs(after - read_image(photo).rgb)[kept].max(-1).mean() < 0.05  # the other one is the photo's
 
 
 def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from relit.asset.asset import load_asset, save_asset
 from relit.asset.gltf import read_asset_file
@@ -21,6 +22,8 @@ from relit.images import read_image, write_srgb
 from relit.rendering.mitsuba_scene import build_scene, render
 from relit.rendering.pile import build_pile, instance_ids, joined
 from relit.scene import Asset, Camera, Mesh
+
+RIM = 0.004  # of the photo's longer side: as much around what is removed is rendered too
 
 
 def edit(
@@ -67,12 +70,25 @@ def edit(
         before, ids = _rendered(asset, camera, spp, seed)
         after, new_ids = _rendered(changed, camera, spp, seed)
         same = material is asset.material
-        labels = np.array([i.label for i in asset.instances if i.registered] + [-1])
-        gone = np.isin(labels[ids], list(remove))
+        gone = cleared(np.array([i.label for i in asset.instances if i.registered] + [0])[ids], _labels_beside(photo, ids.shape), remove)
         own = gone if same else gone | (new_ids >= 0)
         write_srgb(out / "photo.png", np.clip(np.where(own[..., None], after, picture + after - before), 0, 1))
         written.append(out / "photo.png")
     return written
+
+
+def cleared(shown: np.ndarray, told: np.ndarray | None, remove: Sequence[int]) -> np.ndarray:
+    """(H, W) bool: the pixels of the instances `remove`, and a few around them, so that no rim of them stays.
+
+    shown: (H, W) label of the instance that the model shows, 0 where none; told: the photo's own labels, or None.
+    """
+    gone = np.isin(shown, list(remove))
+    others = (shown > 0) & ~gone
+    if told is not None:
+        gone |= np.isin(told, list(remove))
+        others = (others | (told > 0)) & ~gone
+    rim = binary_dilation(gone, iterations=max(2, round(RIM * max(shown.shape))))
+    return gone | (rim & ~others)
 
 
 def insert(
@@ -168,6 +184,18 @@ def _rendered(asset: Asset, camera: Camera, spp: int, seed: int) -> tuple[np.nda
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
     scene = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
     return render(scene, camera, spp=spp, seed=seed)[..., :3], instance_ids(scene, pile, camera)
+
+
+def _labels_beside(photo: str | Path, shape: tuple[int, int]) -> np.ndarray | None:
+    """The labels (H, W) that lie beside the photo, or None where there are none that can be used."""
+    from relit.capture.sfd import open_duplicates, recognise
+
+    try:
+        source = recognise(Path(photo))
+        labels = None if source is None else open_duplicates(source).photos[0].load().labels
+    except UserError:
+        return None
+    return labels if labels is not None and labels.shape == shape else None
 
 
 def _photo(asset: Asset, photo: str | Path) -> tuple[Camera, np.ndarray]:
