@@ -11,6 +11,7 @@ import pytest
 from relit.errors import UserError
 from relit.fit import flash
 from relit.fit.pixels import make_bank
+from relit.masks.threshold import Backdrop
 from relit.rendering.shade_flash import start_learnt
 from relit.scene import Capture, Photo, Sphere
 
@@ -26,6 +27,15 @@ def test_photos_of_a_lit_room_are_refused(device):
     bank, _ = bank_of(scene.cameras(4, 16), 0.3)
     with pytest.raises(UserError, match="surroundings are not dark"):
         flash.check_photos(bank, scene.cameras(4, 16), None, np.full(3, 0.3))
+
+
+def test_photos_before_a_bright_backdrop_are_refused():
+    photo = lambda mask: SimpleNamespace(load=SimpleNamespace(mask=mask))  # noqa: E731
+    with pytest.raises(UserError, match="surroundings are not dark") as error:
+        flash.check_backdrop(SimpleNamespace(photos=[photo(Backdrop(False, 0.05))] * 3 + [photo(None)]))
+    assert "--capture multiview" in error.value.fix
+    for masks in ([Backdrop(True, 0.05)] * 3, [Path("a.png")] * 3, [None]):
+        flash.check_backdrop(SimpleNamespace(photos=[photo(m) for m in masks]))
 
 
 def test_a_flash_that_did_not_fire(device):

@@ -35,6 +35,7 @@ from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
+from relit.masks.threshold import Backdrop
 from relit.materials.plastic_field import MOST_SPECULAR, plastic_pictures, start_plastic
 from relit.materials.rough_plastic import IOR, Coat
 from relit.rendering.shade import features_at
@@ -136,6 +137,7 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     if len(options.levels) != len(options.level_steps):
         raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
     world_from_unit = capture.sphere.world_from_unit
+    check_backdrop(capture)
     bank, cameras, masks, level = load_pixels(capture, options, run)
     check_photos(bank, cameras, masks, level)
     coat = Coat(options.ior)
@@ -158,6 +160,17 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
 def saturation(capture: Capture) -> float:
     """The linear value from which on a pixel may be over-exposed: photos in EXR or HDR are not clipped."""
     return np.inf if all(p.name.lower().endswith((".exr", ".hdr")) for p in capture.photos) else 0.99
+
+
+def check_backdrop(capture: Capture) -> None:
+    """Raises UserError where the masks were found before a plain backdrop that is not dark: other light than the flash falls on it."""
+    backdrops = [p.load.mask for p in capture.photos if isinstance(getattr(p.load, "mask", None), Backdrop)]
+    if sum(not b.dark for b in backdrops) > len(capture.photos) / 2:
+        raise UserError(
+            "the surroundings are not dark: the photos stand before a bright, even backdrop",
+            "a flash capture is taken in a dark room, where the flash is the only light and the background stays black",
+            "take --capture multiview for photos under fixed lamps; or give mask files for flash photos before a bright backdrop",
+        )
 
 
 def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarray) -> None:
