@@ -296,3 +296,25 @@ def test_the_surface_pass_takes_the_network_and_the_first_colours(tmp_path):
     gained = redness[1] - redness[0]
     seen = np.abs(gained) > 1e-3
     assert seen.sum() > 20 and (gained[seen] > 0).mean() > 0.9  # the pixels are red
+
+
+def test_given_cameras_tell_where_photos_were_taken_from():
+    """Cameras in a frame of their own, tilted: their directions about the object, levelled."""
+    from types import SimpleNamespace
+
+    from relit.cameras.se3 import exp_so3, look_at
+    from relit.conventions import similarity
+    from relit.fit.collection_photos import hints_of_cameras
+    from relit.scene import Camera, Sphere
+
+    tilt = similarity(exp_so3(np.array([1.2, 0.3, -0.5])), np.array([4.0, -1.0, 2.0]))
+    eyes = [np.array([3 * np.sin(a), 1.0, 3 * np.cos(a)]) for a in np.arange(8) * np.pi / 4]
+    cameras = [Camera(40, 30, 50.0, 50.0, 20.0, 15.0, tilt @ look_at(eye)) for eye in eyes]
+    photos = [SimpleNamespace(name=f"{i}.png", camera=c) for i, c in enumerate(cameras)]
+    capture = SimpleNamespace(sphere=Sphere(tilt[:3, 3], 0.5), format="llff")
+    hints = hints_of_cameras(capture, photos)
+    found = np.array([hints.directions[p.name] for p in photos])
+    wanted = np.array([eye / np.linalg.norm(eye) for eye in eyes])
+    assert np.allclose(found[:, 1], wanted[:, 1], atol=1e-6)  # the same height
+    assert np.allclose(found @ found.T, wanted @ wanted.T, atol=1e-6)  # and the same turns between them
+    assert "llff" in hints.source and hints.degrees < 45

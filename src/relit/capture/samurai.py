@@ -135,9 +135,9 @@ def direction_of(answers: list, name: str = "", path: Path | str = "") -> np.nda
             raise UserError(what, fix=f"one of {', '.join(words)}: {path}")
     if not out.any():
         raise UserError(
-            f"all three answers for '{name}' are Center",
+            f"all three answers for '{name}' are Center" if name else "all three answers are Center",
             "a camera that is neither left nor right, above nor below, before nor behind would stand inside the object",
-            f"say at least one side, or leave the photo out of the file: {path}",
+            f"say at least one side, or leave the photo out of the file: {path}" if name else "say at least one side",
         )
     return out / np.linalg.norm(out)
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relit.capture.samurai import read_hints
+from relit.cameras.se3 import rotation_from
+from relit.capture.samurai import Hints, read_hints
 from relit.errors import UserError
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_poses import even_colours
@@ -17,6 +18,7 @@ from relit.scene import Camera, Capture, Photo
 
 LEAST_PHOTOS = 4
 FIELD = 50.0  # degrees along the longer side, where EXIF tells nothing
+GIVEN = 20.0  # degrees that directions from given cameras may be off
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ def load_shots(capture: Capture, options: CollectionOptions, run) -> tuple[list[
         raise UserError(what, "shape is found by comparing photos from different sides", "add photos; 30 to 80 all around are good")
     use = options.hints and "quadrants" not in options.without
     hints = read_hints(capture.root, [p.name for p in (*photos, *held)]) if use else None
+    if hints is None and use and capture.has_cameras and capture.sphere is not None:
+        hints = hints_of_cameras(capture, [*photos, *held])
     if hints is not None:
         run.say(f"{len(hints.directions)} of {len(photos) + len(held)} photos have a hint where they were taken from ({hints.source})")
     guessed, shots = 0, []
@@ -74,6 +78,15 @@ def load_shots(capture: Capture, options: CollectionOptions, run) -> tuple[list[
     if len(training) < LEAST_PHOTOS:
         raise UserError(f"only {len(training)} photos have a mask with anything in it", fix="give masks that are white on the object")
     return training, [s for s in kept if s.photo in held], 45.0 if hints is None else hints.degrees
+
+
+def hints_of_cameras(capture: Capture, photos: list[Photo]) -> Hints:
+    """The directions of given cameras (LLFF's, COLMAP's), about the object sphere, turned so that the photos' own upward directions have +y
+    as their mean."""
+    away = {p.name: p.camera.centre - capture.sphere.centre for p in photos if p.camera is not None}
+    up = -np.mean([p.camera.world_from_camera[:3, 1] for p in photos if p.camera is not None], 0)
+    turn = rotation_from(up, np.array([0.0, 1.0, 0.0])) if np.linalg.norm(up) > 1e-6 else np.eye(3)
+    return Hints({name: turn @ v / np.linalg.norm(v) for name, v in away.items()}, GIVEN, f"cameras of {capture.format}")
 
 
 def guessed_camera(photo: Photo, width: int, height: int) -> Camera:
