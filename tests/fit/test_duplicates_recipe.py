@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from relit.asset.asset import load_asset, save_asset
 from relit.asset.gltf import write_glb
-from relit.cameras.se3 import rotation_angle
+from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.capture import open_capture
 from relit.capture.procedural import pawn
 from relit.capture.synthetic_duplicates import RADIUS, heap, synthesize_duplicates
@@ -31,7 +32,7 @@ def pile(tmp_path_factory):
     light = np.full((8, 16, 3), 0.5, np.float32)
     light[1:3, 3:6] = 8.0
     write_linear(folder / "light.exr", light)
-    sizes = {"count": 4, "resolution": 96, "test_resolution": 32, "spp": 8, "test_spp": 8, "test_views": 2}
+    sizes = {"count": 4, "seed": 3, "resolution": 96, "test_resolution": 32, "spp": 8, "test_spp": 8, "test_views": 2}  # all on the ground
     relights = [folder / "light.exr"]
     out = synthesize_duplicates(folder / "pawn.glb", folder / "light.exr", folder / "capture", relights=relights, **sizes)
     again = synthesize_duplicates(folder / "pawn.glb", folder / "light.exr", folder / "capture", relights=relights, **sizes)
@@ -85,6 +86,17 @@ def test_objects_of_a_heap_lie_on_one_another():
     placed = [move_points(p, mesh.vertices) for p in poses]
     gaps = [min(cKDTree(q).query(p)[0].min() for q in placed[:k]) for k, p in enumerate(placed) if p[:, 1].min() > 0.1]
     assert len(gaps) >= 3 and max(gaps) < 0.06 * RADIUS  # a tenth and more on a height field of a third of the detail
+
+
+def test_objects_that_show_too_different_sides_are_said():
+    said = []
+    run = SimpleNamespace(say=said.append)
+    turns = [exp_so3(np.array([0, np.radians(a), 0])) for a in (0, 20, 40, 60)]
+    poses_stage.say_far_apart(np.array([similarity(t, t @ [0, 0, -5.0]) for t in turns]), run)
+    assert not said
+    turns = [exp_so3(np.array([0, np.radians(a), 0])) for a in (0, 70, 140)]
+    poses_stage.say_far_apart(np.array([similarity(t, t @ [0, 0, -5.0]) for t in turns]), run)
+    assert len(said) == 1 and "lie 70 degrees apart" in said[0]
 
 
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):

@@ -12,10 +12,12 @@ import numpy as np
 from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
+from relit.fit.instance_growth import seen_from
 from relit.fit.instance_search import Search, ambiguous, place
 from relit.fit.instances import COARSE, View, carved, views_of
 from relit.scene import Camera, Pixels
 
+FAR = 45.0  # degrees between what an object shows and what the next one does from which on the search is often wrong
 AGREES = 0.2  # an instance whose score lies further below the median did not find its place
 
 Shot = tuple[Pixels, Camera]  # a decoded photo and its camera in its own frame (identity pose)
@@ -64,6 +66,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
         if registered.sum() > 2 and "refinement" not in options.without:
             unsure[registered] = ambiguous([v for v, ok in zip(views, registered, strict=True) if ok], poses[registered], search, seed=seed)
             say_ambiguous(views, unsure, int(registered.sum()), run)
+        say_far_apart(poses[registered], run)
         if matched and not {"guided", "refinement"} & set(options.without):
             poses = adjusted_poses(matched, poses, registered, run)
         poses = centred(views, poses, registered)
@@ -80,6 +83,20 @@ def say_ambiguous(views: list[View], unsure: np.ndarray, registered: int, run) -
             f"note: {len(some)} of {registered} poses are ambiguous (labels {', '.join(some)}): these objects agree about as well with the "
             f"model when turned by {np.median(unsure[unsure > 0]):.0f} degrees; the object is nearly symmetric, its texture repeats, or "
             "what tells is hidden"
+        )
+
+
+def say_far_apart(poses: np.ndarray, run) -> None:
+    """Say where the objects (N, 4, 4) show sides so different that their poses are uncertain whatever their scores."""
+    sides = seen_from(poses)
+    if len(sides) < 2:
+        return
+    away = np.degrees(np.arccos(np.clip(sides @ sides.T, -1, 1))) + 360 * np.eye(len(sides))
+    apart = np.median(away.min(1))
+    if apart > FAR:
+        run.say(
+            f"note: the sides that the objects show lie {apart:.0f} degrees apart (each from the next one, median), and the search is "
+            f"often wrong beyond {FAR:.0f}: look at the rendered photo in the report; more objects or another photo of the pile help"
         )
 
 
