@@ -1,29 +1,34 @@
-"""Where each photo of a collection was taken from when nothing is known: the shape grows from one photo outward.
+"""Where each photo of a collection was taken from when nothing is known: the shape grows outward.
 
-The model starts as one inflated silhouette: only viewpoints near those that it has seen are trusted, the photos that match best join first.
-Several photos are tried as the beginning; those that others agree with least are dropped early.
+It begins with the photos that pairs hold together (collection_pairs.py), or, where these are too few, as one inflated silhouette. Only
+viewpoints near those that the model has seen are trusted, and the photos that match best join first. Of single photos several are tried as
+the beginning; those that others agree with least are dropped early.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from relit.cameras.se3 import rotation_from
 from relit.conventions import similarity
+from relit.fit.collection_pairs import agreeing, inflated, pairs_of, placed_towards
 from relit.fit.collection_poses import (
     HOPELESS,
-    PARTS,
     Schedule,
     best_refined,
     coarse_model,
+    descended,
     gauge,
     polish,
     pose_towards,
     poses_from_hints,
 )
 from relit.fit.register import (
+    TURNS,
     Crop,
+    Gallery,
     crop_rings,
     crop_views,
     directions_around,
@@ -31,26 +36,20 @@ from relit.fit.register import (
     near,
     refine,
     search,
+    turn_angles,
     views_from,
     volume_render,
 )
-from relit.geometry.sdf import node_positions
-from relit.scene import Camera
+from relit.rendering.shade_photos import shade_plain
 
+PARTS = (0.6, 1.0, 0.15, 0.3)  # of register.PARTS: without hints decoration tells more than what is dark and what is bright
+FEWEST = 6  # photos of a set that growth begins from
+FASTER = 1.3  # by which the set grows each round
+AROUND = 40.0  # degrees from viewpoints of the set within which others are trusted
+ONE_SIDE = 75.0  # degrees between viewpoints below which silhouettes leave the depth open
+ROLL = 30.0  # degrees by which photos may be out of upright, where those of the set are upright
+UPRIGHT = 0.03  # weight of that in the search: photos that were turned all the way cost four times as much
 LEVELLED = 0.3  # mean of the photos' upward directions below which they have none in common
-
-
-def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarray:
-    """(n, n, n) bool: where the object may be when one photo was seen from `camera`: as thick as its outline is far."""
-    p = node_positions(nodes).reshape(-1, 3)
-    to_outline = distance_transform_edt(crop.mask > 0.5) * (np.linalg.norm(camera.centre) / camera.fx)
-    q = camera.project(p)
-    u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
-    ok = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    limit = np.zeros(len(p))
-    limit[ok] = np.minimum(to_outline[v[ok], u[ok]] * 1.4, 0.6)
-    depth = np.abs(p @ camera.world_from_camera[:3, 2])
-    return (depth < limit * loosen + 0.03).reshape(nodes, nodes, nodes)
 
 
 def upright(poses: np.ndarray) -> np.ndarray:
@@ -64,6 +63,67 @@ def upright(poses: np.ndarray) -> np.ndarray:
     return similarity(rotation_from(mean / length, np.array([0.0, 1.0, 0.0])), np.zeros(3)) @ poses
 
 
+def rolls(poses: np.ndarray) -> np.ndarray:
+    """(P,) degrees in [0, 180] by which pictures are out of upright, +y being up."""
+    ahead, down = poses[:, :3, 2], np.array([0.0, -1.0, 0.0])
+    hanging = down - ahead * (ahead @ down)[:, None]
+    cosine = (hanging * poses[:, :3, 1]).sum(1) / np.maximum(np.linalg.norm(hanging, axis=1), 1e-9)
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def upright_prior(gallery: Gallery) -> np.ndarray:
+    """(V, TURNS), added to scores: photos are upright to within ROLL degrees or so; next to the poles there is no upright."""
+    seen = np.array([c.centre / np.linalg.norm(c.centre) for c in gallery.cameras])
+    turn = np.degrees(turn_angles(np.arange(TURNS))) / ROLL
+    return -UPRIGHT * (1 - seen[:, 1] ** 2)[:, None] * np.minimum(turn**2, 4)
+
+
+def depth_limit(crops: list[Crop], poses: np.ndarray, nodes: int) -> np.ndarray | None:
+    """(n, n, n) bool: where the object may be, told by the photo in the middle of the others, while all look from one side: then their
+    silhouettes leave its depth open. None where they go around it."""
+    centres = poses[:, :3, 3] / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
+    middle = int((centres @ centres.mean(0)).argmax())
+    spread = np.degrees(np.arccos(np.clip((centres @ centres[middle]).min(), -1, 1)))
+    if spread >= ONE_SIDE:
+        return None
+    return inflated(crops[middle], crop_views([crops[middle]], poses[middle][None])[0], nodes, 1 + spread / 40)
+
+
+def grow_set(
+    crops: list[Crop], poses: np.ndarray, used: list[int], seed: int, say, rings, nodes: int = 48, steps: int = 150, views: int = 400
+):
+    """Poses (P, 4, 4) and scores (P,) from the photos `used` on, whose poses are known roughly. Each round descends with their poses free,
+    each under a light of its own, registers all photos in the model that comes of it, and takes more of them.
+
+    Where the photos of the set are upright by and large, so are the others: most wrong matches are not."""
+    count, sizes = len(crops), [len(used)] * 3
+    while sizes[-1] < count:
+        sizes.append(min(count, int(np.ceil(sizes[-1] * FASTER))))
+    poses, scores = np.array(poses), np.zeros(count)
+    for i, size in enumerate([*sizes, count]):
+        poses[used] = upright(poses[used])
+        hangs = bool(np.median(rolls(poses[used])) < ROLL and np.linalg.norm(poses[used][:, :3, 1].mean(0)) >= LEVELLED)
+        some = [crops[k] for k in used]
+        limit = depth_limit(some, gauge(some, poses[used]), nodes)
+        if i == 0:
+            model = coarse_model(some, gauge(some, poses[used]), nodes, steps, 0.2, seed, limit)
+        else:
+            model, moved = descended(some, poses[used], nodes, steps, seed + i, None, limit)
+            poses[used] = gauge(some, moved)
+            model = replace(model, appearance=shade_plain)
+        render = volume_render(model)
+        gallery = make_gallery(render, views_from(directions_around(views, seed + i)), PARTS)
+        centres = poses[used][:, :3, 3] / np.linalg.norm(poses[used][:, :3, 3], axis=1, keepdims=True)
+        allowed = np.tile(near(gallery, centres, AROUND).any(0), (count, 1))
+        prior = np.broadcast_to(upright_prior(gallery), (count, len(gallery.cameras), TURNS)) if hangs else None
+        found = search(crops, gallery, 1, rings=rings, allowed=allowed, prior=prior)
+        poses, scores = refine(crops, found.poses[:, 0], render, rings=rings, steps=(0, 4.0, 2.0) if i else (0,), parts=PARTS)
+        poses = gauge(crops, poses)
+        used = sorted(np.argsort(-scores)[:size].tolist())
+        say(f"grown from a set: {len(used)} of {count} photos, mean score {scores[used].mean():.3f}", poses, scores)
+    return poses, scores
+
+
 def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=None, nodes: int = 40):
     """Poses (P, 4, 4) and scores (P,) from one photo on: round i registers all photos and keeps the sizes[i] best for the next model."""
     rings = crop_rings(crops, PARTS) if rings is None else rings
@@ -75,7 +135,7 @@ def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=
         centres = np.array([poses[k][:3, 3] / np.linalg.norm(poses[k][:3, 3]) for k in used])
         spread = np.degrees(np.arccos(np.clip((centres @ centres[used.index(first)]).min(), -1, 1)))
         camera = crop_views([crops[first]], anchor[None])[0]
-        limit = inflated(crops[first], camera, nodes, 1 + spread / 40) if spread < 75 else None
+        limit = inflated(crops[first], camera, nodes, 1 + spread / 40) if spread < ONE_SIDE else None
         tolerance = 0.4 if len(used) < 5 else 0.2 if i < len(sizes) - 2 else 0.12
         model = coarse_model(some, poses[used], nodes, 60 if len(used) < 10 else 90, tolerance, seed + i, limit)
         render = volume_render(model)
@@ -132,8 +192,15 @@ def find_poses(
 
 
 def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
-    """Grow from several photos for a few rounds, go on with the one that agrees best, and settle with all photos."""
+    """Grow from a set that pairs hold together. Where it is too small grow from several photos for a few rounds, and go on with the one
+    that agrees best. Settle with all photos."""
     rings, count = crop_rings(crops, PARTS), len(crops)
+    placed = agreeing(pairs_of(crops, rings, PARTS, seed), count) if count >= 2 * FEWEST else {}
+    if len(placed) >= FEWEST:
+        say(f"pairs hold {len(placed)} of {count} photos together")
+        poses = np.array([placed_towards(c, placed.get(k, np.eye(3))) for k, c in enumerate(crops)])
+        poses, scores = grow_set(crops, poses, sorted(placed), seed, say, rings)
+        return settle(crops, poses, scores, rings, keep, seed, say)
     first = start_photos(crops, rings, starts)
     early = sorted({min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2)})
     tried = []

@@ -14,15 +14,14 @@ WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "l
 class CollectionOptions:
     """side: pixels of the photos' longer side. rounds: of coarse fit and registration. polish: turns of descent and search after them.
     keep: hypotheses of each photo that are refined (SAMURAI's multiplex). assignment: 'best': one of them takes part in the coarse fits;
-    'soft': several, by SAMURAI's shares with memory and momentum. hints: whether quadrants or angles are used. holdout: every so
-    many photos are set aside (0: none but those of held_out.json). starts: photos that growth begins from without hints. least_score: of
-    the registration, on average, and least_agreement: share of photos that find their place in a model of the others, below which the
-    poses are taken for wrong. levels, level_steps, rays: of the volume pass.
-    refine_cameras: step of the camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass.
-    frozen_steps: of the fit of held-out photos. light_network: folder of Neural-PIL's network, which then takes the place of the shipped
-    prior of lights. init_colour: weight of SAMURAI's L_init in the surface pass, a tenth of it after the share lambda_a of its steps (80k
-    of 300k in the paper). lambda_c: sharpness of the soft assignment in the first and the last round. without: what an ablation switches
-    off.
+    'soft': several, by SAMURAI's shares with memory and momentum. hints: whether quadrants or angles are used. holdout: every so many
+    photos are set aside (0: none but those of held_out.json). starts: photos that growth begins from without hints, where pairs hold too
+    few together. least_score: of the registration, on average, and least_agreement: share of photos that find their place in a model of
+    the others, below which the poses are taken for wrong. levels, level_steps, rays: of the volume pass. refine_cameras: step of the
+    camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass. frozen_steps: of the fit of
+    held-out photos. light_network: folder of Neural-PIL's network, which then takes the place of the shipped prior of lights.
+    init_colour: weight of SAMURAI's L_init in the surface pass, a tenth of it after the share lambda_a of its steps (80k of 300k in the
+    paper). lambda_c: sharpness of the soft assignment in the first and the last round. without: what an ablation switches off.
     """
 
     side: int = 400

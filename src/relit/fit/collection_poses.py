@@ -170,11 +170,13 @@ def best_refined(crops, found, render, rings, keep: int, steps=REFINE):
     return best, score
 
 
-def descended(crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed: int, held=None) -> tuple[VolumeModel, np.ndarray]:
-    """A model with one small light per photo, fitted with the poses free, but for those of `held` photos (P,); and the poses. Focal
-    lengths stay."""
+def descended(
+    crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed: int, held=None, limit=None
+) -> tuple[VolumeModel, np.ndarray]:
+    """A model (VolumeModel) with one small light per photo, fitted with the poses free, but for those of `held` photos (P,); and the poses.
+    Focal lengths stay. limit: as in `coarse_model`."""
     cameras = crop_views(crops, gauge(crops, poses))
-    model = start_model(hull_by_vote(cameras, not_empty(crops), nodes, 0.12), np.full(3, GREY), None, full=False)
+    model = start_model(hull_by_vote(cameras, not_empty(crops), nodes, 0.12, limit), np.full(3, GREY), None, full=False)
     model.reflections, model.rates = start_photo_lights(np.full((len(crops), 3), GREY), GREY)
     model.appearance = shade_photos
     bank = crop_bank(crops, cameras)
