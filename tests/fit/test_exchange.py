@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from relit.conventions import environment_directions, environment_solid_angles
-from relit.fit.exchange import Exchange, hat_weights
+from relit.fit.exchange import Exchange, hat_weights, mirrored
 
 LIGHT, SIZE = 16, 12
 
@@ -22,9 +22,9 @@ def start(seed=0, hats=4):
     return exchange, normals.reshape(-1, 3), light, colour.reshape(-1, 4)
 
 
-def move(exchange, light, colour, g_light, g_colour, rate=0.02):
+def move(exchange, light, colour, g_light, g_colour, rate=0.02, metallic=None):
     to = lambda a: mi.Float(np.ascontiguousarray(a, np.float32).ravel())  # noqa: E731
-    colour, log_light = exchange.step(to(colour), to(np.log(light)), to(g_colour), to(g_light), rate)
+    colour, log_light = exchange.step(to(colour), to(np.log(light)), to(g_colour), to(g_light), rate, metallic)
     return np.array(colour).reshape(-1, 4), np.exp(np.array(log_light).reshape(light.shape))
 
 
@@ -67,6 +67,42 @@ def test_one_scale_is_among_the_moves_and_follows_the_slope():
     c = np.log(after / light)
     np.testing.assert_allclose(c, np.broadcast_to([-0.02, 0.02, 0.0], c.shape), atol=1e-4)
     np.testing.assert_allclose(after_colour[:, :3], colour[:, :3] * np.exp([0.02, -0.02, 0.0]), rtol=1e-4)
+
+
+def test_what_is_mirrored_counts_as_reflectance():
+    """Black paint reflects too: all that a texel reflects, times the light, stays, and its colour, which could not fall further, pulls."""
+    exchange, _, light, colour = start()
+    colour[:, :3] = 0.0
+    colour[:50, 1] = 0.3
+    g_colour = np.zeros_like(colour)
+    g_colour[50:, :3] = -0.1  # the black ones would rather be brighter, so that the light falls
+    metallic = np.zeros(SIZE**2, np.float32)
+    metallic[-20:] = 1  # metal reflects nothing besides its base colour
+    after_colour, after = move(exchange, light, colour, np.zeros_like(light), g_colour, metallic=mi.Float(metallic))
+    c = np.log(after / light)
+    np.testing.assert_allclose(c, np.full_like(c, -0.02), atol=1e-4)
+    s = np.array(mirrored(mi.Float(0.4)))[0] * (1 - metallic)[:, None]
+    np.testing.assert_allclose(after_colour[:, :3] + s, (colour[:, :3] + s) * np.exp(0.02), rtol=1e-4)
+    still, _ = move(start()[0], light, np.where(np.arange(4) < 3, 0.0, colour), np.zeros_like(light), g_colour)
+    assert not still[:, :3].any()
+
+
+@pytest.mark.parametrize("roughness", [0.15, 0.3, 0.5, 0.7, 1.0])
+def test_mirrored_is_what_black_paint_reflects_under_even_light(roughness):
+    """Over views that stand on the hemisphere by their cosine; directions of the light by mirrors drawn from GGX."""
+    from relit.materials.brdf import Surface, evaluate, ggx_d
+
+    rng = np.random.default_rng(4)
+    a, n = roughness**2, 200_000
+    u, phi = rng.uniform(size=(2, n)), rng.uniform(0, 2 * np.pi, (2, n))
+    z = np.sqrt([1 - u[0], (1 - u[1]) / (1 + (a * a - 1) * u[1])])
+    r = np.sqrt(1 - z * z)
+    v, h = (mi.Vector3f(*d.astype(np.float32)) for d in np.stack([r * np.cos(phi), r * np.sin(phi), z], 1))
+    l = 2 * dr.dot(v, h) * h - v
+    density = ggx_d(h.z, a) * h.z / (4 * dr.maximum(dr.dot(v, h), 1e-6))
+    black = Surface(mi.Color3f(0.0), mi.Float(roughness), mi.Float(0.0))
+    f = dr.select((l.z > 0) & (dr.dot(v, h) > 0), evaluate(black, mi.Vector3f(0, 0, 1), v, l).x / density, 0)
+    assert np.array(f).mean() == pytest.approx(np.array(mirrored(mi.Float(roughness)))[0], abs=0.006)
 
 
 def test_without_normals_every_texel_is_as_if_it_faced_all_sides():

@@ -10,7 +10,9 @@ from relit.fit import first_material as first
 from relit.fit.multiview import MultiviewOptions, reconstruct
 from relit.run import Run
 
-SMALL = MultiviewOptions(levels=(24, 40), level_steps=(60, 60), rays=2048, faces=2000, texture=64, surface_steps=600, points=1024, light=16)
+SMALL = MultiviewOptions(
+    hollows=0, levels=(24, 40), level_steps=(60, 60), rays=2048, faces=2000, texture=64, surface_steps=600, points=1024, light=16
+)
 SIZE = 64
 
 

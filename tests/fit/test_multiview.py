@@ -14,6 +14,7 @@ from relit.images import read_image
 from relit.run import Run, Stage
 
 TINY = MultiviewOptions(
+    hollows=0,
     levels=(24, 40),
     level_steps=(60, 60),
     rays=1024,
@@ -190,7 +191,7 @@ def test_every_ablation_changes_the_result(capture_folder, tmp_path, monkeypatch
     seen = {"blocked": 0.0}
     options = replace(TINY, level_steps=(4, 4), surface_steps=3)
     if without == "hull":
-        options = replace(options, levels=(32,), level_steps=(0,))
+        options = replace(options, hollows=0, levels=(32,), level_steps=(0,))
     else:
         options = replace(options, without=(without,))
     found = multiview.surface_options(options)

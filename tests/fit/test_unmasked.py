@@ -14,6 +14,7 @@ from relit.run import Run
 from relit.scene import Sphere
 
 OPTIONS = MultiviewOptions(
+    hollows=0,
     levels=(24, 40),
     level_steps=(80, 80),
     rays=2048,

@@ -33,7 +33,14 @@ FLOOR = 0.005  # of the error of a pixel: what is explained so well needs no oth
 ROSE = 0.54  # mean metallic of a group that is metal, after the short fit from .5
 STEPS = 300  # of each fit, but at most half of those of the pass
 TEXTURE = 128  # texels a side
-TRIAL = {"texture": TEXTURE, "light_steps": 0, "slope_rate": 0.0, "metallic_sparse": 0.003, "metallic_binary": 0.003}
+TRIAL = {  # of the short fits
+    "texture": TEXTURE,
+    "light_steps": 0,
+    "slope_rate": 0.0,
+    "exchange_mirrored": False,
+    "metallic_sparse": 0.003,
+    "metallic_binary": 0.003,
+}
 BATCHES = 8  # of pixels that the fits are judged by
 
 

@@ -93,10 +93,20 @@ def without(values: np.ndarray, hollows: np.ndarray | None) -> np.ndarray:
 
 
 def surface_error(bank: PixelBank, model: VolumeModel, o: HollowOptions, seed: int):
-    """(mean error, (n, n, n) mean error of the rays whose surface point is near each node, NaN where there are none): squared differences
-    of display values over whole object pixels."""
+    """(mean error, (n, n, n) mean error of the rays whose surface point is near each node, NaN where there are none)."""
     n = o.nodes
-    rng = mi.PCG32(size=o.probes, initstate=seed + 77)
+    value, hit, x = ray_errors(bank, model, o.probes, seed)
+    value, flat = value[hit], nearest_node(x[hit], n)
+    value = np.minimum(value, 4 * value.mean())  # highlights
+    total, count = (np.bincount(flat, w, n**3).reshape(n, n, n) for w in (value, np.ones_like(value)))
+    total, count = gaussian_filter(total, o.blur), gaussian_filter(count, o.blur)
+    return float(value.mean()), np.where(count > 0.02, total / np.maximum(count, 1e-9), np.nan)
+
+
+def ray_errors(bank: PixelBank, model: VolumeModel, count: int, seed: int):
+    """Of `count` drawn rays, the same for the same seed: the squared difference of display values (N,), whether the ray shows a whole pixel
+    of the object and meets the surface (N,) bool, and where it meets it (N, 3)."""
+    rng = mi.PCG32(size=count, initstate=seed + 77)
     with dr.suspend_grad():
         k = dr.minimum(mi.UInt32(rng.next_float32() * dr.width(bank.candidates)), dr.width(bank.candidates) - 1)
         batch = batch_of(bank, dr.gather(mi.UInt32, bank.candidates, k))
@@ -106,15 +116,15 @@ def surface_error(bank: PixelBank, model: VolumeModel, o: HollowOptions, seed: i
         colour, _ = model.shade(m, batch, bank.cameras)
         r = dr.square(colour - batch.rgb) * display_weight(batch.rgb)
         value = (r.x + r.y + r.z) / 3
-        ok = (m.opacity > 0.5) & (batch.mask > 0.99) & dr.isfinite(value)
+        hit = (m.opacity > 0.5) & (batch.mask > 0.99) & dr.isfinite(value)
         x = batch.o + batch.d * (m.depth / dr.maximum(m.opacity, 0.05))
-        value, ok, x = np.array(value), np.array(ok), np.array(x).T
-    node = np.clip(np.round((x[ok] * 0.5 + 0.5) * (n - 1)).astype(int), 0, n - 1)
-    flat = (node[:, 2] * n + node[:, 1]) * n + node[:, 0]
-    value = np.minimum(value[ok], 4 * value[ok].mean())  # highlights
-    total, count = (np.bincount(flat, w, n**3).reshape(n, n, n) for w in (value, np.ones_like(value)))
-    total, count = gaussian_filter(total, o.blur), gaussian_filter(count, o.blur)
-    return float(value.mean()), np.where(count > 0.02, total / np.maximum(count, 1e-9), np.nan)
+        return np.array(value), np.array(hit), np.array(x).T
+
+
+def nearest_node(x: np.ndarray, n: int) -> np.ndarray:
+    """(N,) index into a flat (n, n, n) grid of points (N, 3) of the unit frame."""
+    node = np.clip(np.round((x * 0.5 + 0.5) * (n - 1)).astype(int), 0, n - 1)
+    return (node[:, 2] * n + node[:, 1]) * n + node[:, 0]
 
 
 def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: HollowOptions) -> np.ndarray | None:
@@ -127,6 +137,12 @@ def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: Hollo
     good = skin & ~bad
     if bad.sum() < o.least or not good.any():
         return None
+    return left_without(inside, bad, good, cameras, o)
+
+
+def left_without(inside: np.ndarray, bad: np.ndarray, good: np.ndarray, cameras: list[Camera], o: HollowOptions) -> np.ndarray | None:
+    """Distances of `inside` without what can be reached through the skin `bad`, but for a wall along the skin `good` and what the
+    silhouettes need; None where that is nothing, or nearly all. All (n, n, n) bool."""
     far = inside & (distance_transform_edt(~good) > o.wall)
     gone = binary_propagation(bad & far, mask=far)
     for votes in KEEP:  # a handle is bare in most photos; what is behind a handle that is gone is so in few

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from relit.errors import UserError, did_you_mean
 from relit.files import write_text
 from relit.fit.explore import explore, first_shape
 from relit.fit.first_material import PAINT, describe, first_material
+from relit.fit.hollows import without
+from relit.fit.lids import FIRST, open_lids
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras, sphere_pixels
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
@@ -42,10 +45,10 @@ STAGES = ("volume", "mesh", "surface")
 
 @dataclass(frozen=True)
 class MultiviewOptions:
-    """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. max_pixels: photos are
-    shrunk until all together have no more. refine_cameras: step of the camera corrections in the volume pass (0: cameras are exact).
-    normal: weight of normal priors read from files. background, explore_steps: nodes a side of the radiance
-    field for photos without masks, and the steps that fit it.
+    """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. hollows: flat faces of the
+    visual hull that are asked whether they are lids (fit/lids.py). max_pixels: photos are shrunk until all together have no more.
+    refine_cameras: step of the camera corrections in the volume pass (0: cameras are exact). normal: weight of normal priors read from
+    files. background, explore_steps: nodes a side of the radiance field for photos without masks, and the steps that fit it.
     faces: of the mesh, about. texture: texels a side. surface_steps, points, directions: steps of the surface pass, pixels per step,
     directions per pixel. light_steps: after so many of them the light rests (0: never). light: rows of the environment map. without:
     parts of the surface pass that are switched off, names of WITHOUT.
@@ -54,6 +57,7 @@ class MultiviewOptions:
     levels: tuple[int, ...] = (128, 256)
     level_steps: tuple[int, ...] = (500, 500)
     rays: int = 8192
+    hollows: int = 3
     max_pixels: int = 24_000_000
     refine_cameras: float = 0.0
     normal: float = 0.05
@@ -94,6 +98,7 @@ PRESETS = {
         "levels": (48, 96),
         "level_steps": (150, 180),
         "rays": 4096,
+        "hollows": 0,
         "max_pixels": 8_000_000,
         "background": 64,
         "explore_steps": 200,
@@ -132,7 +137,7 @@ def volume_options(o: MultiviewOptions) -> VolumeOptions:
 
 
 def surface_options(o: MultiviewOptions) -> SurfaceOptions:
-    own = {"smooth_colour": SMOOTH_COLOUR, "light_even": LIGHT_EVEN, "light_steps": o.light_steps}
+    own = {"smooth_colour": SMOOTH_COLOUR, "light_even": LIGHT_EVEN, "light_steps": o.light_steps, "exchange_mirrored": True}
     own |= {key: value for name in o.without for key, value in WITHOUT[name].items()}
     return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **own)
 
@@ -242,6 +247,10 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
                     "look at `relit inspect INPUT`; give --sphere X Y Z RADIUS, or --masks none to do without masks",
                     code=4,
                 ) from None
+            if options.hollows > 0 and not stage.load("checkpoint"):
+                coarse = visual_hull(cameras, masks, FIRST.nodes)
+                fresh = partial(start_model, level=level, background=None, full=True)
+                values = without(values, open_lids(bank, cameras, coarse, fresh, run.say, seed, options.hollows))
             model = start_model(values, level, None, full=False)
         else:
             try:

@@ -33,16 +33,16 @@ class SurfaceOptions:
     columns).
 
     colour_rate, roughness_rate, metallic_rate, light_rate: largest move of a value (of log radiance for the light) per step; exchange_rate:
-    of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows. warm: part of light_steps over which colour_rate
-    rises from a twentieth. roughness_start: first roughness. smooth_roughness, smooth_metallic, smooth_colour: weights of differences
-    between similar neighbours, up to similarity_reach (unit frame) apart and similarity_width in base colour; smooth_shade: power of
-    `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary, metallic_sparse: of m (1 - m), and of the distance of
-    m from the side that a place began on, 0 or 1. bright: of base colour beyond WHITE, squared. light_smooth: total variation of the log
-    radiance. light_neutral: its chroma; light_even: its squared distance from its mean. light_steps: after them the light rests, and
-    `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width, parsimony_share: see `parsimony`. slope_rate,
-    slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth: weights of `slope_prior`,
-    whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise does not move it at full
-    rate.
+    of `Exchange` (log), whose moves of the light are hats of a map of exchange_rows rows; exchange_mirrored: what is mirrored counts there.
+    warm: part of light_steps over which colour_rate rises from a twentieth. roughness_start: first roughness. smooth_roughness,
+    smooth_metallic, smooth_colour: weights of differences between similar neighbours, up to similarity_reach (unit frame) apart and
+    similarity_width in base colour; smooth_shade: power of `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary,
+    metallic_sparse: of m (1 - m), and of the distance of m from the side that a place began on, 0 or 1. bright: of base colour beyond
+    WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma; light_even: its squared distance from its
+    mean. light_steps: after them the light rests, and `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width,
+    parsimony_share: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves.
+    slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser
+    (see `Adam`), so that noise does not move it at full rate.
     """
 
     steps: int = 700
@@ -56,6 +56,7 @@ class SurfaceOptions:
     light_rate: float = 0.05
     exchange_rate: float = 0.02
     exchange_rows: int = 4
+    exchange_mirrored: bool = False
     warm: float = 0.3
     roughness_start: float = 0.4
     smooth_roughness: float = 0.1
@@ -203,8 +204,9 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             if i % REFRESH == 0 or i == first:
                 exchange.refresh(environment.image())
             dr.eval(material.colour, model.log_light)
-            rate = options.exchange_rate * light_decay
-            material.colour, model.log_light = exchange.step(material.colour, model.log_light, gradients[0], gradients[2], rate)
+            rate, metallic = options.exchange_rate * light_decay, material.metallic if options.exchange_mirrored else None
+            pulls = (gradients[0], gradients[2])
+            material.colour, model.log_light = exchange.step(material.colour, model.log_light, *pulls, rate, metallic)
         project(material)
         dr.eval(model.log_light, material.colour, material.metallic, material.slope)
         environment.radiance = dr.exp(model.log_light)

@@ -1,0 +1,90 @@
+"""A hollow that no silhouette shows is found under its flat lid; a solid face stays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relit.cameras.se3 import look_at
+from relit.fit.lids import FIRST, THEN, flat_faces, open_lids, opened_at
+from relit.geometry.hull import distance_of
+from relit.geometry.sdf import node_positions
+from relit.scene import Camera
+
+N, SIZE = 40, 72
+P = node_positions(N)
+BOX = (np.abs(P[..., 0]) < 0.5) & (np.abs(P[..., 2]) < 0.45) & (np.abs(P[..., 1]) < 0.3)
+ROOM = (np.abs(P[..., 0]) < 0.38) & (np.abs(P[..., 2]) < 0.33) & (P[..., 1] < 0.15)  # open below
+FIRST_SMALL = replace(FIRST, nodes=N, steps=60, rays=2048, least=60, probes=40_000)
+THEN_SMALL = replace(THEN, nodes=N + 8, steps=120, rays=2048, probes=40_000)
+
+
+def cameras():
+    out = []
+    for height in (-2.2, -0.9, 0.0, 1.2):
+        for turn in np.linspace(0, 2 * np.pi, 8, endpoint=False) + height:
+            o = np.array([np.cos(turn), 0, np.sin(turn)]) * np.sqrt(9 - height**2) + [0, height, 0]
+            out.append(Camera(SIZE, SIZE, 95.0, 95.0, SIZE / 2, SIZE / 2, look_at(o)))
+    return out
+
+
+def photographed(inside):
+    """Photos of a shape, striped inside and out: bank, and a start for fits."""
+    import mitsuba as mi
+
+    from relit.device import use_device
+
+    use_device("cpu")
+    from relit.fit.pixels import make_bank
+    from relit.fit.register import volume_render
+    from relit.fit.volume import start_model
+
+    level = np.array([0.3, 0.3, 0.3])
+    model = start_model(distance_of(inside), level, None, full=True)
+    stripes = [0.3 + 0.25 * np.sin(k * P[..., 0] + 1) * np.cos(k * P[..., c]) for k, c in ((14, 2), (12, 1), (13, 2))]
+    colours = np.stack([*stripes, 0 * stripes[0]], -1)
+    model.grid.features = mi.Float(np.concatenate([np.zeros((1, 4)), colours.reshape(-1, 4)]).astype(np.float32).ravel())
+    model.inv_s = 3.0 / model.grid.h
+    rgb, alpha = volume_render(model)(cameras())
+    return make_bank(cameras(), list(rgb), list(alpha)), lambda values: start_model(values, level, None, full=True)
+
+
+def found(inside):
+    bank, start = photographed(inside)
+    said = []
+    gone = open_lids(bank, cameras(), distance_of(BOX), start, said.append, faces=2, first=FIRST_SMALL, then=THEN_SMALL)
+    return gone, said
+
+
+def test_hollow_under_a_lid_is_opened():
+    gone, said = found(BOX & ~ROOM)
+    assert len(said) == 1 and "falls to" in said[0]
+    assert (gone < 0)[ROOM & BOX].mean() > 0.6
+    assert (gone < 0)[~ROOM].mean() < 0.01
+
+
+def test_solid_box_stays_whole():
+    gone, said = found(BOX)
+    assert gone is None and not said
+
+
+def test_faces_of_a_box_and_what_is_behind_them():
+    faces = flat_faces(distance_of(BOX))
+    below = max((f for f in faces if P[f][:, 1].max() < -0.2), key=np.sum)
+    assert below.sum() > 0.7 * (BOX & (P[..., 1] < -0.27)).sum()
+    trial, mouth = opened_at(BOX, below, cameras(), replace(FIRST_SMALL, wall=2.0))
+    assert (mouth <= below).all() and mouth.any()
+    assert (trial < 0)[BOX & (P[..., 1] > 0.25)].all(), "the wall opposite stays"
+    assert not (trial < 0)[mouth].any()
+
+
+def test_ball_has_no_large_flat_face():
+    r = np.linalg.norm(P, axis=-1)
+    assert max((f.sum() for f in flat_faces((r - 0.6).astype(np.float32))), default=0) < 0.12 * (np.abs(r - 0.6) < 0.03).sum()
+
+
+@pytest.mark.parametrize("n", [24])
+def test_nothing_is_asked_of_a_thin_thing(n):
+    p = node_positions(n)
+    thin = (np.abs(p[..., 1]) < 0.09) & (np.hypot(p[..., 0], p[..., 2]) < 0.7)
+    assert all(opened_at(thin, f, cameras(), replace(FIRST, nodes=n)) is None for f in flat_faces(distance_of(thin)))
