@@ -107,13 +107,26 @@ def test_settling_never_ends_worse_than_it_began(photos, monkeypatch):
     monkeypatch.setattr(collection_growth, "volume_render", lambda _: None)
     monkeypatch.setattr(collection_growth, "make_gallery", lambda *_: None)
     monkeypatch.setattr(collection_growth, "search", lambda *_, **__: None)
-    monkeypatch.setattr(collection_growth, "best_refined", lambda *_: (poses, np.full(len(crops), next(means))))
+    monkeypatch.setattr(collection_growth, "best_refined", lambda *_, **__: (poses, np.full(len(crops), next(means))))
     rings = crop_rings(crops)
     _, kept = collection_growth.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
     assert kept.mean() == pytest.approx(0.95)
     means = iter([0.5, 0.6, 0.7])
     _, kept = collection_growth.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
     assert kept.mean() == pytest.approx(0.9)
+
+
+def test_settling_searches_and_refines_with_what_growth_compares(photos):
+    """The whole of it, once: what is compared has as many parts everywhere."""
+    from relit.fit.collection_growth import PARTS, settle
+    from relit.fit.collection_poses import even_colours
+    from relit.fit.register import crop_photo, crop_rings
+
+    some = photos[:5]
+    crops = even_colours([crop_photo(*p) for p in some])
+    poses = np.array([c.world_from_camera for *_, c in some])
+    settled, scores = settle(crops, poses, np.zeros(len(crops)), crop_rings(crops, PARTS), 1, 0, lambda *_: None, rounds=1)
+    assert scores.mean() > 0.7 and settled.shape == poses.shape
 
 
 def test_photos_without_hints_end_upright(photos):

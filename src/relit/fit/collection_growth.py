@@ -237,7 +237,7 @@ def settle(crops: list[Crop], poses: np.ndarray, scores: np.ndarray, rings, keep
         render = volume_render(model)
         gallery = make_gallery(render, views_from(directions_around(500, seed + 100 + i)), PARTS)
         found = search(crops, gallery, keep, rings=rings)
-        poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1)
+        poses, scores = best_refined(crops, found, render, rings, keep if i == rounds - 1 else 1, parts=PARTS)
         say(f"settling, round {i + 1} of {rounds}: mean score {scores.mean():.3f}", poses, scores)
         if scores.mean() > best[0]:
             best = (float(scores.mean()), poses, scores)

@@ -160,11 +160,11 @@ def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, 
     return gauge(crops, poses), scores
 
 
-def best_refined(crops, found, render, rings, keep: int, steps=REFINE):
-    """Refine the first `keep` hypotheses of each photo, and take the best."""
+def best_refined(crops, found, render, rings, keep: int, steps=REFINE, parts=PARTS):
+    """Refine the first `keep` hypotheses of each photo, and take the best. rings: of the crops, made with `parts`."""
     best, score = found.poses[:, 0].copy(), np.full(len(crops), -1.0)
     for k in range(min(keep, found.poses.shape[1])):
-        poses, scores = refine(crops, found.poses[:, k], render, rings=rings, steps=steps, parts=PARTS)
+        poses, scores = refine(crops, found.poses[:, k], render, rings=rings, steps=steps, parts=parts)
         better = (scores > score) & (found.scores[:, k] > -1)
         best[better], score[better] = poses[better], scores[better]
     return best, score
