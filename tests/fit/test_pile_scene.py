@@ -7,7 +7,7 @@ import pytest
 
 from relit.cameras.se3 import exp_so3
 from relit.conventions import environment_directions, move_points, similarity
-from relit.fit.pile_scene import SETTLED, distance_in, ground_reflectance, light_below, set_down
+from relit.fit.pile_scene import ONTO, SETTLED, distance_in, ground_reflectance, light_below, set_down
 from relit.geometry.sdf import node_positions
 
 UP = np.array([0.0, -np.sin(0.9), -np.cos(0.9)])  # of the ground, in the photo's frame
@@ -53,7 +53,7 @@ def test_what_floats_or_sinks_is_set_down_along_its_line_of_sight():
     assert np.allclose(poses[:, :3, :3], wrong[:, :3, :3])
 
 
-def test_what_lies_deep_in_the_ground_is_lifted_and_what_floats_over_another_comes_to_rest_on_it():
+def test_what_lies_deep_in_the_ground_is_lifted_and_what_floats_over_another_comes_nearer_to_it():
     vertices = ball(6000)
     side, ahead = np.cross(UP, [1.0, 0, 0]), np.array([1.0, 0, 0])
     at = [np.array([0, 0, 10.0]) + a * 1.9 * ahead + b * 1.9 * side + 0.8 * UP for a in (-1, 0, 1) for b in (-1, 0, 1)]
@@ -67,7 +67,9 @@ def test_what_lies_deep_in_the_ground_is_lifted_and_what_floats_over_another_com
     poses, _, count = set_down(vertices, seen, np.stack([[0, 0, 10.0], UP]), from_ball)
     assert count == len(at)
     for k, p in enumerate(poses):
-        assert np.linalg.norm(np.linalg.inv(p)[:3, 3] - true[k][:3, 3]) < 0.03, k
+        part = ONTO if k > 8 else 1.0  # of the way
+        expected = true[k][:3, 3] * (1 + (1 - part) * shift[k])
+        assert np.linalg.norm(np.linalg.inv(p)[:3, 3] - expected) < 0.015, k
 
 
 def test_distances_between_nodes_and_beyond_the_cube():

@@ -20,6 +20,7 @@ TOUCHES = 0.08  # unit lengths within which an instance counts as touching the g
 SETTLED = 4  # instances that must touch the ground before their distances follow it
 FARTHEST = 0.02  # of its distance that an instance is moved at most
 BESIDE = 0.005  # the same for what is moved onto another instance, or from farther above the ground: that it rests there is a guess
+ONTO = 0.35  # of that way that it goes: its size tells its distance to .035 radii, touching another to .05, as few see the undersides
 TILT = 5.0  # degrees that the ground may turn meanwhile
 STEEP = 0.3  # sine of the angle at which the photo must look down on the ground for objects to be moved onto something
 GROUND_ROWS = 96
@@ -53,8 +54,8 @@ def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray, distance: Distance) -> tuple[np.ndarray, np.ndarray, int]:
-    """Poses (N, 4, 4) and the plane after every instance was moved along its line of sight until it rests on the ground or on another, and
-    how many were. distance: of points in the object's frame from its surface, negative inside.
+    """Poses (N, 4, 4) and the plane after every instance was moved along its line of sight until it rests on the ground, or a part of the
+    way until it rests on another, and how many were. distance: of points in the object's frame from its surface, negative inside.
 
     The distance of an object is known by its size alone, and half a per cent of the distance is a tenth of an object; the plane under many
     of them is known far better, and nothing hangs in the air or lies below the ground. The plane goes through the middle of the lowest
@@ -80,7 +81,7 @@ def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray, distanc
         if -(ray @ up) > STEEP * np.linalg.norm(ray):
             share, most = gaps[k] / -(ray @ up), FARTHEST  # of the distance: the object's middle moves by share * ray
             if gaps[k] > TOUCHES:
-                share, most = resting_share(points, standing, k, placed, distance, share), BESIDE
+                share, most = ONTO * resting_share(points, standing, k, placed, distance, share), ONTO * BESIDE
             if abs(share) < most:
                 standing[k][:3, 3] += share * ray
                 count += 1
