@@ -157,3 +157,24 @@ def test_solids_of_single_photos_find_their_neighbours():
     turns = [photos[p.first][2].world_from_camera[:3, :3].T @ photos[p.second][2].world_from_camera[:3, :3] for p in pairs]
     assert len(pairs) >= 2
     assert np.mean([rotation_angle(p.rotation.T @ t) < 25 for p, t in zip(pairs, turns, strict=True)]) > 0.6
+
+
+@pytest.mark.parametrize(("photos", "held", "begins"), [(14, 8, "set"), (14, 4, "photo"), (9, 8, "photo")])
+def test_growth_begins_from_pairs_where_they_hold_enough(monkeypatch, photos, held, begins):
+    from relit.fit import collection_growth as growth
+
+    asked, grown = [], []
+    monkeypatch.setattr(growth, "crop_rings", lambda *_: None)
+    monkeypatch.setattr(growth, "pairs_of", lambda *_: asked.append(1))
+    monkeypatch.setattr(growth, "agreeing", lambda *_: {k: np.eye(3) for k in range(held)})
+    monkeypatch.setattr(growth, "placed_towards", lambda crop, rotation: np.eye(4))
+    monkeypatch.setattr(growth, "start_photos", lambda *_: [0])
+    done = (np.tile(np.eye(4), (photos, 1, 1)), np.full(photos, 0.9))
+    monkeypatch.setattr(growth, "grow_set", lambda crops, poses, used, *_: grown.append(("set", used)) or done)
+    monkeypatch.setattr(growth, "grow", lambda *_: grown.append(("photo", None)) or done)
+    monkeypatch.setattr(growth, "settle", lambda *_: done)
+    said = []
+    growth.poses_by_growth([None] * photos, 1, 1, 0, said.append)
+    assert grown[0][0] == begins and bool(asked) == (photos >= 12)
+    if begins == "set":
+        assert grown == [("set", list(range(8)))] and said == ["pairs hold 8 of 14 photos together"]

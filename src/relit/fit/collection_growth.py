@@ -193,14 +193,13 @@ def find_poses(
 
 def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
     """Grow from a set that pairs hold together. Where it is too small grow from several photos for a few rounds, and go on with the one
-    that agrees best. Settle with all photos."""
+    that agrees best, and settle with all photos."""
     rings, count = crop_rings(crops, PARTS), len(crops)
     placed = agreeing(pairs_of(crops, rings, PARTS, seed), count) if count >= 2 * FEWEST else {}
     if len(placed) >= FEWEST:
         say(f"pairs hold {len(placed)} of {count} photos together")
         poses = np.array([placed_towards(c, placed.get(k, np.eye(3))) for k, c in enumerate(crops)])
-        poses, scores = grow_set(crops, poses, sorted(placed), seed, say, rings)
-        return settle(crops, poses, scores, rings, keep, seed, say)
+        return grow_set(crops, poses, sorted(placed), seed, say, rings)
     first = start_photos(crops, rings, starts)
     early = sorted({min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2)})
     tried = []
