@@ -157,7 +157,7 @@ class Cost:
 
 
 # Whole jobs on 2 cores with 60 photos of 400x400, cold start: (seconds, peak bytes) by quality, and what more photos or pixels add.
-MEASURED = {"draft": (50.0, 0.9e9), "standard": (215.0, 2.0e9), "high": (1000.0, 3.0e9)}
+MEASURED = {"draft": (50.0, 0.9e9), "standard": (250.0, 2.1e9), "high": (1000.0, 3.0e9)}
 MEASURED_PHOTOS, MEASURED_PIXELS = 60, 400 * 400
 SECONDS_PER_PHOTO = {"cameras": 3.0, "load": 0.05}
 BYTES_PER_PIXEL = 40.0  # a decoded photo and its share of the pixel bank

@@ -41,6 +41,7 @@ TRIAL = {  # of the short fits
     "metallic_sparse": 0.003,
     "metallic_binary": 0.003,
 }
+EXCHANGE_RATE = 0.02  # at most
 BATCHES = 8  # of pixels that the fits are judged by
 
 
@@ -48,7 +49,7 @@ def first_material(
     bank: PixelBank, mesh: TraceableMesh, base: np.ndarray, known: np.ndarray, radiance: float, normals, options: SurfaceOptions, seed=0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Metallic and roughness to begin with, (S, S) float32 each. base, known, radiance, normals: as of `start_surface`."""
-    o = replace(options, steps=min(STEPS, options.steps // 2), **TRIAL)
+    o = replace(options, steps=min(STEPS, options.steps // 2), exchange_rate=min(options.exchange_rate, EXCHANGE_RATE), **TRIAL)
     given = (base, known) if normals is None else (base, known, normals)
     small = [cv2.resize(np.asarray(a, np.float32), (TEXTURE, TEXTURE), interpolation=cv2.INTER_AREA) for a in given]
     fits = []

@@ -79,6 +79,7 @@ class MultiviewOptions:
 
 
 SMOOTH_COLOUR = 0.1  # of SurfaceOptions: here many photos see each place under one light
+EXCHANGE_RATE = 0.04  # of SurfaceOptions: the light must have arrived when it comes to rest
 LIGHT_EVEN = 1e-3  # of SurfaceOptions: holds the light where photos do not tell it from base colour
 
 WITHOUT = {  # what an ablation switches off: settings of the surface pass
@@ -137,7 +138,8 @@ def volume_options(o: MultiviewOptions) -> VolumeOptions:
 
 
 def surface_options(o: MultiviewOptions) -> SurfaceOptions:
-    own = {"smooth_colour": SMOOTH_COLOUR, "light_even": LIGHT_EVEN, "light_steps": o.light_steps, "exchange_mirrored": True}
+    own = {"smooth_colour": SMOOTH_COLOUR, "light_even": LIGHT_EVEN, "light_steps": o.light_steps}
+    own |= {"exchange_rate": EXCHANGE_RATE, "exchange_mirrored": True}
     own |= {key: value for name in o.without for key, value in WITHOUT[name].items()}
     return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, **own)
 
