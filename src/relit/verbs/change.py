@@ -38,7 +38,14 @@ def edit_flags(parser: Parser) -> None:
     add("--base-color", type=colour, default=None, metavar="R,G,B", help="linear, in place of the texture")
     add("--roughness", type=float, default=None, help="a constant in place of the map")
     add("--metallic", type=float, default=None, help="a constant in place of the map")
-    add("--remove", type=int, nargs="*", default=[], metavar="LABEL", help="instances to take away; labels beside --photo say exactly where they are")
+    add(
+        "--remove",
+        type=int,
+        nargs="*",
+        default=[],
+        metavar="LABEL",
+        help="instances to take away; labels beside --photo say exactly where they are",
+    )
     add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
     more("--spp", type=int, default=64, help="samples a pixel (default 64)")
     more("--overwrite", action="store_true", help="replace what is there")
