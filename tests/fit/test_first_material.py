@@ -108,6 +108,17 @@ def test_a_group_begins_on_the_side_that_explains_it_clearly_better(metal, metal
     assert not is_metal[1] and not is_dull[1]
 
 
+@pytest.mark.parametrize("other, taken", [(0.8, True), (1.0, False), (1.2, False)])
+def test_paint_that_hardly_gains_follows_the_rest_of_the_paint(other, taken):
+    """The first group gains 2 % as dull paint, which short fits leave uncertain; the second, twice as large, decides, not the metal."""
+    pixels = np.array([100, 200, 100])
+    as_paint, as_metal, as_dull = ([1.0, 1, 5], [1.1, 1.1, 1], [0.98, other, 4])
+    fits = [np.stack([100 * np.array(e) * [1, 2, 1], [10, 20, 90], pixels], 1) for e in (as_paint, as_metal, as_dull)]
+    is_metal, is_dull = first.explained_better(*fits)
+    assert list(is_metal) == [False, False, True]
+    assert list(is_dull) == [taken, other == 0.8, False]
+
+
 def test_a_dull_start_is_taken_where_the_short_fit_is_better(tmp_path, monkeypatch):
     """What the decision says reaches the pass: everything that is called dull begins so."""
     monkeypatch.setattr(first, "explained_better", lambda paint, metal, dull: (paint[:, 0] < 0, paint[:, 0] >= 0))
