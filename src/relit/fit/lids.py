@@ -85,9 +85,14 @@ def open_lids(
 
 
 def opened_at(inside: np.ndarray, lid: np.ndarray, cameras: list[Camera], o: HollowOptions) -> tuple[np.ndarray, np.ndarray] | None:
-    """Distances of a shape that is opened through a flat face, and the part of the face that is gone; None where nothing can be opened."""
+    """Distances of a shape that is opened through a flat face, and the part of the face that is gone; None where nothing can be opened.
+    No deeper than the mouth is wide: further in no photo sees, and a small dent would cost the whole inside."""
     trial = left_without(inside, lid & inside, skin_of(inside) & ~lid, cameras, o)
-    return None if trial is None else (trial, lid & (trial >= 0))
+    if trial is None:
+        return None
+    mouth = lid & (trial >= 0)
+    gone = inside & (trial >= 0) & (distance_transform_edt(~mouth) <= np.sqrt(mouth.sum() / np.pi))
+    return (distance_of(inside & ~gone), mouth) if gone.sum() >= o.least else None
 
 
 def skin_of(inside: np.ndarray) -> np.ndarray:
