@@ -68,6 +68,11 @@ def test_solid_box_stays_whole():
     assert gone is None and not said
 
 
+def test_few_photos_are_not_asked():
+    """Their hull has flat facets everywhere; no fit is begun."""
+    assert open_lids(None, cameras()[:16], distance_of(BOX), None, None) is None
+
+
 def test_faces_of_a_box_and_what_is_behind_them():
     faces = flat_faces(distance_of(BOX))
     below = max((f for f in faces if P[f][:, 1].max() < -0.2), key=np.sum)

@@ -26,6 +26,7 @@ THEN = HollowOptions(nodes=96, steps=400, gain=0.2)  # and those that gain by it
 FLAT = 0.9  # cosine between normals of one face
 THICK = 1.5  # voxels from the plane of a face
 SEEDS = 60  # faces are grown from so many places at most
+PHOTOS = 24  # the hull of fewer is made of facets of their silhouettes' cones, which the volume pass wears down by itself
 RAYS = 500  # of the probes must meet a face that is asked
 
 
@@ -45,6 +46,8 @@ def open_lids(
     values: (n, n, n) distances of the hull, n = first.nodes. cameras: unit frame. start: distances -> a fresh model of the capture kind.
     faces: how many are asked, the largest first.
     """
+    if len(cameras) < PHOTOS:
+        return None
     hull = values < 0
     some = cameras[:: max(1, len(cameras) // 40)]
 
