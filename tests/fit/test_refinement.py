@@ -14,16 +14,8 @@ from relit.run import Run
 from relit.scene import Sphere
 
 OPTIONS = MultiviewOptions(
-    hollows=0,
-    levels=(24, 48),
-    level_steps=(80, 120),
-    rays=1024,
-    faces=3000,
-    texture=64,
-    surface_steps=4,
-    points=256,
-    directions=16,
-    light=8,
+    levels=(24, 48), level_steps=(80, 120), rays=1024, hollows=0, faces=3000, texture=64, surface_steps=4, points=256, light=8,
+    directions=16
 )
 BALL = Sphere(np.zeros(3), 0.75)
 

@@ -130,7 +130,7 @@ def nearest_node(x: np.ndarray, n: int) -> np.ndarray:
 def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: HollowOptions) -> np.ndarray | None:
     """Distances of the shape without what lies under its badly explained surface; None where that is nothing, or nearly all."""
     inside = shape < 0
-    skin = inside & (distance_transform_edt(inside) < 1.5) & np.isfinite(where)
+    skin = skin_of(inside) & np.isfinite(where)
     if not skin.any():
         return None
     bad = skin & (where > o.bad * np.quantile(where[skin], o.well))
@@ -138,6 +138,11 @@ def opened(shape: np.ndarray, where: np.ndarray, cameras: list[Camera], o: Hollo
     if bad.sum() < o.least or not good.any():
         return None
     return left_without(inside, bad, good, cameras, o)
+
+
+def skin_of(inside: np.ndarray) -> np.ndarray:
+    """The outermost nodes of a shape, (n, n, n) bool."""
+    return inside & (distance_transform_edt(inside) < 1.5)
 
 
 def left_without(inside: np.ndarray, bad: np.ndarray, good: np.ndarray, cameras: list[Camera], o: HollowOptions) -> np.ndarray | None:

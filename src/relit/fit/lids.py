@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label, uniform_filter
 
-from relit.fit.hollows import HollowOptions, left_without, nearest_node, ray_errors
+from relit.fit.hollows import HollowOptions, left_without, nearest_node, ray_errors, skin_of
 from relit.fit.loop import NoStage
 from relit.fit.pixels import PixelBank
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
@@ -89,18 +89,13 @@ def open_lids(
 
 def opened_at(inside: np.ndarray, lid: np.ndarray, cameras: list[Camera], o: HollowOptions) -> tuple[np.ndarray, np.ndarray] | None:
     """Distances of a shape that is opened through a flat face, and the part of the face that is gone; None where nothing can be opened.
-    No deeper than the mouth is wide: further in no photo sees, and a small dent would cost the whole inside."""
+    No deeper than the radius of the mouth: little further in is seen, and a small dent would cost the whole inside."""
     trial = left_without(inside, lid & inside, skin_of(inside) & ~lid, cameras, o)
     if trial is None:
         return None
     mouth = lid & (trial >= 0)
     gone = inside & (trial >= 0) & (distance_transform_edt(~mouth) <= np.sqrt(mouth.sum() / np.pi))
     return (distance_of(inside & ~gone), mouth) if gone.sum() >= o.least else None
-
-
-def skin_of(inside: np.ndarray) -> np.ndarray:
-    """The outermost nodes of a shape, (n, n, n) bool."""
-    return inside & (distance_transform_edt(inside) < 1.5)
 
 
 def flat_faces(values: np.ndarray) -> list[np.ndarray]:
