@@ -37,11 +37,12 @@ src/relit/viewer/static/index.html: $(VIEWER)
 	  || echo "npm could not build the page; relit view says so" >&2; \
 	else echo "no npm: the page of relit view is not built" >&2; fi
 
-# what is published: a source archive and a wheel with the page in it
+# what is published: a source archive and a wheel with the page in it, which is installed into an empty environment and passes the demo there
 dist: setup viewer
 	@test -f src/relit/viewer/static/index.html || { echo "error: the page is not built; a wheel needs it" >&2; exit 5; }
 	rm -rf dist build
 	$(VENV)/bin/python -m build --outdir dist .
+	$(NICE) $(VENV)/bin/python tools/check_release.py dist/*.whl --demo
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache tools/validator/node_modules viewer/node_modules src/relit/viewer/static src/relit.egg-info

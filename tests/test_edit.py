@@ -12,8 +12,9 @@ from relit.asset.asset import load_asset, save_asset
 from relit.cameras.se3 import look_at
 from relit.capture.procedural import pawn
 from relit.conventions import similarity
-from relit.edit import edit, insert
+from relit.edit import as_shown, camera_of, edit, insert
 from relit.errors import UserError
+from relit.files import digests
 from relit.images import read_image, write_srgb
 from relit.rendering.mitsuba_scene import build_scene, render
 from relit.rendering.pile import build_pile, instance_ids
@@ -105,6 +106,67 @@ def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):
 
 
 def test_another_photo_is_refused(run, tmp_path):
-    write_srgb(tmp_path / "wide.png", np.zeros((20, 80, 3), np.float32))
+    write_srgb(tmp_path / "photo.png", np.zeros((20, 80, 3), np.float32))
     with pytest.raises(UserError, match="another photo"):
-        edit(run[0], tmp_path / "a", photo=tmp_path / "wide.png", roughness=0.5)
+        edit(run[0], tmp_path / "a", photo=tmp_path / "photo.png", roughness=0.5)
+    write_srgb(tmp_path / "holiday.png", read_image(run[1]).rgb)
+    for change in (
+        lambda: edit(run[0], tmp_path / "a", photo=tmp_path / "holiday.png", roughness=0.5),
+        lambda: insert(run[0], run[0], tmp_path / "x.png", photo=tmp_path / "holiday.png", at=(5, 5)),
+    ):
+        with pytest.raises(UserError, match="none of the photos") as error:
+            change()
+        assert "photo.png" in error.value.why and "holiday.png" in error.value.fix
+
+
+@pytest.fixture(scope="module")
+def two(run, tmp_path_factory):
+    """(asset folder, folder of photos): the same pile in two photos from different sides; the second one's labels are its own."""
+    folder, asset = tmp_path_factory.mktemp("two"), load_asset(run[0])
+    poses = [i.world_from_object for i in asset.instances]
+    pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
+    scene = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
+    second = asset.cameras[0][1].with_pose(look_at([4.0, 3.5, 2.5], (0, 0.4, 0)))
+    cameras = (("a/photo.png", asset.cameras[0][1]), ("b/photo.png", second))
+    for name, camera in cameras:
+        write_srgb(folder / name, np.clip(render(scene, camera, spp=64, seed=9)[..., :3], 0, 1))
+    ids = instance_ids(scene, pile, second)
+    cv_write(str(folder / "b" / "photo_labels.png"), np.array([20, 10, 0], np.uint8)[ids])  # the other way round
+    meta = {"inputs": digests(folder, [name for name, _ in cameras])}
+    return save_asset(folder / "asset", replace(asset, cameras=cameras, meta=meta)), folder
+
+
+def test_the_camera_is_that_of_the_photo(two, tmp_path):
+    run, folder = two
+    asset = load_asset(run)
+    assert [camera_of(asset, folder / name)[0] for name in ("a/photo.png", "b/photo.png")] == ["a/photo.png", "b/photo.png"]
+    (tmp_path / "copy.png").write_bytes((folder / "b" / "photo.png").read_bytes())
+    assert camera_of(asset, tmp_path / "copy.png")[0] == "b/photo.png"  # by its content
+    (tmp_path / "photo.png").write_bytes((folder / "b" / "photo.png").read_bytes())
+    assert camera_of(asset, tmp_path / "photo.png")[0] == "b/photo.png"  # by name it could be both
+    (tmp_path / "photo.png").write_bytes(b"retouched")
+    with pytest.raises(UserError, match="cannot be told"):
+        camera_of(asset, tmp_path / "photo.png")
+
+
+def test_the_second_photo_of_a_pile_is_changed_from_its_own_camera(two, tmp_path):
+    run, folder = two
+    photo, asset = folder / "b" / "photo.png", load_asset(run)
+    before, camera = read_image(photo).rgb, asset.cameras[1][1]
+    edit(run, tmp_path / "same", photo=photo, tint=(1, 1, 1), spp=16)
+    after = read_image(tmp_path / "same" / "photo.png").rgb
+    assert np.abs(after - before).mean() < 0.03  # an unchanged material lies where the photo shows it
+    edit(run, tmp_path / "one", photo=photo, remove=[20], spp=16)
+    after = read_image(tmp_path / "one" / "photo.png").rgb
+    (u, v, _), (x, y, _) = (camera.project(np.array([s, 0.6, 0.0])).astype(int) for s in (1.0, -1.0))
+    assert np.ptp(after[v - 2 : v + 3, u - 2 : u + 3].reshape(-1, 3).mean(0)) < 0.06  # grey ground
+    assert np.abs(after - before)[y - 3 : y + 4, x - 3 : x + 4].mean() < 0.02  # the other one stays
+    foot = camera.project(np.array([1.0, 0.0, 1.6]))[:2]
+    out = insert(run, run, tmp_path / "new.png", photo=photo, at=tuple(foot), size=0.6, spp=16)
+    u, v = foot.astype(int)
+    assert np.abs(read_image(out).rgb - before)[v - 8 : v - 1, u - 2 : u + 3].mean() > 0.04
+
+
+def test_labels_of_another_photo_in_the_numbers_of_the_run():
+    shown = np.array([[10, 10, 20, 20, 0, 0]])
+    assert as_shown(np.array([[7, 7, 8, 0, 9, 9]]), shown).tolist() == [[10, 10, 20, 0, 0, 0]]

@@ -94,6 +94,24 @@ def test_sixteen_bit_files_turn_as_eight_bit_ones(tmp_path, orientation):
     np.testing.assert_allclose(images.read_image(tmp_path / "a.png").rgb, linear_from_srgb(wide / np.float32(255)), rtol=1e-6)
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_of_a_png_in_a_raw_profile(tmp_path, orientation):
+    """ImageMagick writes EXIF as hexadecimal text; header, pixels and small copy agree about it."""
+    from PIL.PngImagePlugin import PngInfo
+
+    codes = np.random.default_rng(0).integers(0, 255, (24, 32, 3)).astype(np.uint8)
+    exif, info = PilImage.Exif(), PngInfo()
+    exif[0x0112] = orientation
+    block = exif.tobytes()
+    info.add_text("Raw profile type exif", f"\nexif\n{len(block):8d}\n{block.hex()}\n", zip=True)
+    PilImage.fromarray(codes).save(tmp_path / "a.png", pnginfo=info)
+    image, header = images.read_image(tmp_path / "a.png"), images.read_header(tmp_path / "a.png")
+    np.testing.assert_allclose(image.rgb, linear_from_srgb(images.turn_upright(codes, orientation) / np.float32(255)), rtol=1e-6)
+    assert (header.height, header.width, header.orientation) == (*image.rgb.shape[:2], orientation)
+    np.testing.assert_allclose(images.read_small(tmp_path / "a.png", 64).rgb, image.rgb, atol=1e-5)
+    assert images.read_image(tmp_path / "a.png", upright=False).rgb.shape == (24, 32, 3)
+
+
 def test_exif_focal_is_the_35mm_equivalent_on_the_diagonal(tmp_path):
     exif = PilImage.Exif()
     exif.get_ifd(0x8769)[0xA405] = 26
@@ -107,6 +125,17 @@ def test_nan_in_an_exr_is_refused_with_its_place(tmp_path):
     images.write_linear(tmp_path / "a.exr", array)
     with pytest.raises(UserError, match=r"1 pixels that are NaN or infinite .*column 3, row 2"):
         images.read_image(tmp_path / "a.exr")
+
+
+def test_a_tiff_of_grey_floats_is_linear_and_checked(tmp_path):
+    grey = np.linspace(0, 2, 48, dtype=np.float32).reshape(6, 8)
+    PilImage.fromarray(grey).save(tmp_path / "a.tif")
+    for rgb in (images.read_image(tmp_path / "a.tif").rgb, images.read_small(tmp_path / "a.tif").rgb):
+        np.testing.assert_array_equal(rgb, np.repeat(grey[..., None], 3, axis=2))
+    grey[2, 3] = np.nan
+    PilImage.fromarray(grey).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match=r"1 pixels that are NaN or infinite .*column 3, row 2"):
+        images.read_image(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".exr", ".hdr"])

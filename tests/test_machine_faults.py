@@ -294,3 +294,34 @@ def test_memory_stays_flat_over_500_steps(capture, tmp_path, masks, passes):
     grown = {line.split()[0]: float(line.split()[1]) for line in done.stdout.splitlines() if len(line.split()) == 2}
     assert passes <= set(grown), done.stdout
     assert all(mb < 6 for mb in grown.values()), grown
+
+
+def flash_photos(folder: Path) -> tuple[Path, list[str]]:
+    """The ball with cameras in a file that tells no kind, and the words that make it a small flash job."""
+    return write_capture(folder), ["--capture", "flash", "--set", "hollows=0"]
+
+
+def collection_photos(folder: Path) -> tuple[Path, list[str]]:
+    """The ball from six sides with masks and quadrants, and the words that make it a small job."""
+    from test_faults_of_kinds import collection
+
+    small = {"side": 48, "rounds": 1, "polish": 0, "keep": 1, "frozen_steps": 4, "least_score": 0.1}
+    pairs = [w for k, v in small.items() for w in ("--set", f"{k}={v}")]
+    return collection(folder), ["--capture", "collection", *pairs, "--set", "without=links"]
+
+
+@pytest.mark.parametrize("make", [flash_photos, collection_photos], ids=lambda m: m.__name__)
+def test_kill_9_in_the_surface_pass_of_other_kinds(capsys, tmp_path, make):
+    photos, flags = make(tmp_path / "photos")
+    tiny = [w for k, v in TINY.items() if k != "light" for w in ("--set", f"{k}={v}")]
+    words = ["reconstruct", photos, "-o", tmp_path / "run", "--quality", "draft", "--device", "cpu", *tiny, *flags]
+    process = subprocess.run([sys.executable, "-c", KILLED + JOB, "surface", *map(str, words)], capture_output=True, timeout=100)
+    assert process.returncode == -signal.SIGKILL, process.stderr.decode()
+    stages = tmp_path / "run/stages"
+    assert (stages / "volume/DONE").exists() and not (stages / "surface/DONE").exists() and not (tmp_path / "run/asset").exists()
+    before = (stages / "volume/DONE").stat().st_mtime_ns
+    code, _, err = relit(capsys, *words)
+    assert code == 0, err
+    assert (stages / "volume/DONE").stat().st_mtime_ns == before  # what was done is not done again
+    asset = load_asset(tmp_path / "run")
+    assert len(asset.mesh.faces) > 50 and np.isfinite(asset.material.base_color).all() and (tmp_path / "run/report.html").is_file()

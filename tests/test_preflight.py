@@ -12,10 +12,11 @@ from PIL import Image
 from relit import cli
 from relit.cameras.se3 import look_at
 from relit.conventions import srgb_from_linear, world_from_gl_camera
+from relit.errors import UserError
 from relit.preflight import inspect
 from relit.preflight.cameras import fundamental, match, widest_gap
 from relit.preflight.drift import drift
-from relit.preflight.light import LIMB, light_regime, limb_slopes, shading_fits
+from relit.preflight.light import LIMB, check_flash_light, light_regime, limb_slopes, shading_fits
 from relit.preflight.look import Exif, look_at_photos, read_exif, sharpness
 from relit.scene import Camera, Capture, Photo, Pixels, Sphere
 
@@ -116,6 +117,85 @@ def test_a_lamp_at_the_camera_is_told_from_the_outline(tmp_path):
     assert len(limb_slopes(look_at_photos(capture(tmp_path, [fixed] * 8, mask=False)))) == 0
 
 
+def told(capture):
+    """What `check_flash_light` says."""
+    said = []
+    check_flash_light(capture, said.append)
+    return said
+
+
+def test_a_flash_capture_is_let_through(tmp_path):
+    assert told(capture(tmp_path, [flash] * 8, [(0.002,) * 3] * 8)) == []
+    assert told(capture(tmp_path, [flash] * 8, with_cameras=False)) == []  # before a visible backdrop, with masks
+
+
+@pytest.mark.parametrize("with_cameras", [True, False])
+def test_light_that_stands_still_is_no_flash(tmp_path, with_cameras):
+    with pytest.raises(UserError, match="does not move with the camera: it looks fixed") as error:
+        told(capture(tmp_path, [fixed] * 14, [(0.0,) * 3] * 14, with_cameras=with_cameras))
+    assert "--capture multiview" in error.value.fix and "check_light=false" in error.value.fix
+
+
+def test_few_photos_are_not_refused(tmp_path):
+    said = told(capture(tmp_path, [fixed] * 8, [(0.2,) * 3] * 8))
+    assert len(said) == 1 and "does not look like a flash" in said[0]
+
+
+def test_one_viewpoint_under_a_moving_lamp_is_no_flash_capture(tmp_path):
+    with pytest.raises(UserError, match="all photos are taken from one place, under a light that moves"):
+        told(capture(tmp_path, [sun(i) for i in range(6)], same=True, with_cameras=False, mask=False))
+
+
+def test_what_is_uncertain_about_a_flash_is_said(tmp_path):
+    said = told(capture(tmp_path, [fixed] * 8, mask=False))
+    assert len(said) == 1 and "does not look like a flash" in said[0]
+
+
+def with_alpha(folder, light):
+    """A capture of the ball on disk: PNG with alpha, cameras in transforms.json."""
+    frames = []
+    for i, camera in enumerate(cameras(14)):
+        pixels = ball_photo(camera, light, (0.0, 0.0, 0.0))
+        rgba = np.concatenate([srgb_from_linear(np.clip(pixels.rgb, 0, 1)), pixels.mask[..., None]], -1)
+        Image.fromarray((rgba * 255 + 0.5).astype(np.uint8)).save(folder / f"{i}.png")
+        pose = world_from_gl_camera(camera.world_from_camera).tolist()
+        frames.append({"file_path": f"{i}.png", "transform_matrix": pose})
+    head = {"w": SIDE, "h": SIDE, "fl_x": FOCAL, "fl_y": FOCAL, "cx": SIDE / 2, "cy": SIDE / 2}
+    (folder / "transforms.json").write_text(json.dumps({**head, "frames": frames}))
+    return folder
+
+
+def test_the_light_is_looked_at_before_a_flash_reconstruction(tmp_path, monkeypatch):
+    """The environment-lit set with alpha is refused before anything is computed, and goes on when asked to; a flash set goes on."""
+    from relit.fit import flash as recipe
+    from relit.reconstruct import reconstruct
+
+    class GoesOn(Exception):
+        pass
+
+    def stop(*args):
+        raise GoesOn
+
+    monkeypatch.setattr(recipe, "reconstruct", stop)
+    for name, light in (("room", fixed), ("flash", flash)):
+        (tmp_path / name).mkdir()
+        with_alpha(tmp_path / name, light)
+    job = {"capture": "flash", "quality": "draft", "report": False}
+    with pytest.raises(UserError, match="does not move with the camera"):
+        reconstruct(tmp_path / "room", tmp_path / "run", **job)
+    with pytest.raises(GoesOn):
+        reconstruct(tmp_path / "room", tmp_path / "run2", pairs=["check_light=false"], **job)
+    with pytest.raises(GoesOn):
+        reconstruct(tmp_path / "flash", tmp_path / "run3", **job)
+
+
+def test_the_mug_is_told_about_its_light_first(shared, tmp_path):
+    from relit.reconstruct import reconstruct
+
+    with pytest.raises(UserError, match="taken from one place, under a light that moves"):
+        reconstruct(shared / "real" / "flash_mug", tmp_path / "run", capture="flash", quality="draft", report=False)
+
+
 def test_blur_exposure_and_tint_are_found(tmp_path):
     def changed(i, pixels):
         rgb = pixels.rgb
@@ -211,3 +291,44 @@ def test_the_page(tmp_path, capsys):
     assert page.count("<figure>") >= 6 and "<svg" in page and found["light_regime"]["guess"] in page
     assert found["looked_at"] == 6 and len(found["drift"]["photos"]) == 6 and found["coverage"]["fill"] > 0.3
     assert cli.main(["inspect", str(folder), "--html", str(tmp_path / "p.html")]) == 3  # nothing is overwritten
+
+
+def planned(capsys, folder, *flags):
+    code = cli.main(["inspect", str(folder), "--json", *flags])
+    out = capsys.readouterr()
+    assert code == 0, out.err
+    return json.loads(out.out)
+
+
+def test_an_input_is_planned_as_what_it_is_said_to_be(tmp_path, capsys):
+    """Photos with cameras in files that tell no kind: stages, cost, and the light that is expected are those of --capture."""
+    folder = write(tmp_path / "photos", n=6, side=96)
+    plain = planned(capsys, folder, "--masks", "none")
+    flash = planned(capsys, folder, "--masks", "none", "--capture", "flash")
+    assert (plain["capture"], flash["capture"]) == ("multiview", "flash") and "flash" in flash["light"]
+    assert flash["estimate"]["seconds"] < plain["estimate"]["seconds"]
+    (folder / "transforms.json").unlink()
+    many = planned(capsys, folder, "--masks", "none", "--capture", "collection", "--max-side", "64")
+    assert many["capture"] == "collection" and many["stages"][0] == "links" and many["sizes"] == [[64, 64]]
+    assert planned(capsys, folder, "--masks", "none")["stages"][0] == "cameras"
+    kinds = [w["what"] for w in flash["warnings"] if "a flash capture expects flash light" in w["what"]]
+    assert bool(kinds) == (flash["light_regime"]["guess"] != "flash" and flash["light_regime"]["confidence"] >= 0.25)
+
+
+def test_a_photo_of_duplicates_is_planned_by_its_segmenter(tmp_path, capsys, monkeypatch):
+    """--masks segment:FILE.onnx and --focal reach the reader, as in `relit reconstruct`."""
+    import relit.capture.sfd as sfd
+
+    labels = np.zeros((96, 160), np.int32)
+    for k in range(3):
+        cv2.circle(labels, (30 + 48 * k, 48), 18, k + 1, -1)
+    monkeypatch.setattr(sfd, "Network", lambda path: path)
+    monkeypatch.setattr(sfd, "found_instances", lambda network, rgb: labels)
+    cv2.imwrite(str(tmp_path / "pile.png"), np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8))
+    words = ["--capture", "duplicates", "--masks", "segment:mine.onnx"]
+    found = planned(capsys, tmp_path / "pile.png", *words, "--focal", "200")
+    assert found["capture"] == "duplicates" and found["stages"][0] == "poses" and "several identical objects" in found["light"]
+    assert any("3 objects found by mine.onnx" in n for n in found["notes"]) and not any("focal length" in n for n in found["notes"])
+    assert any("focal length is not known" in n for n in planned(capsys, tmp_path / "pile.png", *words)["notes"])
+    code = cli.main(["inspect", str(tmp_path / "pile.png"), "--capture", "duplicates"])
+    assert code == 3 and "no labels were found" in capsys.readouterr().err

@@ -126,10 +126,10 @@ def test_comparison_measures_where_the_object_is_drawn(asset, monkeypatch):
     camera = asset.cameras[1][1]
     rgb = render(scene, camera, spp=64)[..., :3]
     photo = Photo(asset.cameras[1][0], lambda: Pixels(rgb), 80, 60, camera)
-    body = report._comparison(asset, scene, Capture(None, "photos", (photo,)))
+    body = report._comparison(asset, Capture(None, "photos", (photo,)))
     got = float(re.search(r": ([\d.]+) dB", body)[1])
     assert got > 20
-    grey = report._comparison(asset, scene, capture_of(asset))
+    grey = report._comparison(asset, capture_of(asset))
     assert float(re.search(r": ([\d.]+) dB", grey)[1]) < got
 
 

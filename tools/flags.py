@@ -26,20 +26,24 @@ def row(action) -> str:
     return f"| {name}{value} | {(action.help or '') + choices} |".replace("<", "&lt;")
 
 
+def rows_of(verb: str, kind: str | None) -> list[str]:
+    return [row(a) for a in parser_for(verb, [kind] if kind else [])._actions if a.dest != "help"]
+
+
+def table(*head: str, rows: list[str]) -> str:
+    return "\n".join([*head, "| flag | meaning |", "|---|---|", *rows]) + "\n"
+
+
 def page() -> str:
     parts = [HEAD]
     for verb, spec in VERBS.items():
-        kinds = list(spec.kinds) or [None]
-        seen: set[str] = set()
-        for kind in kinds:
-            parser = parser_for(verb, [kind] if kind else [])
-            rows = [row(a) for a in parser._actions if a.dest != "help"]
-            rows = [r for r in rows if r not in seen]
-            seen |= set(rows)
-            title = f"## relit {verb}" if kind is None or kind == kinds[0] else f"### relit {verb} {kind}: flags of its own"
-            about = f"\n{spec.summary[0].upper()}{spec.summary[1:]}.\n" if kind in (None, kinds[0]) else ""
-            if rows:
-                parts.append("\n".join([title, about, "| flag | meaning |", "|---|---|", *rows]) + "\n")
+        rows = {kind: rows_of(verb, kind) for kind in (list(spec.kinds) or [None])}
+        common = [r for r in next(iter(rows.values())) if all(r in some for some in rows.values())]
+        parts.append(table(f"## relit {verb}", f"\n{spec.summary[0].upper()}{spec.summary[1:]}.\n", rows=common))
+        for kind, all_rows in rows.items():
+            own = [r for r in all_rows if r not in common]
+            if kind and own:
+                parts.append(table(f"### relit {verb} {kind}: flags of its own", "", rows=own))
     return "\n".join(parts)
 
 

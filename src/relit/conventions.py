@@ -85,6 +85,11 @@ def world_from_mitsuba_camera(world_from_camera):
     return np.asarray(world_from_camera, dtype=np.float64) @ FLIP_XY
 
 
+def cv_from_mitsuba_axes(vector):
+    """(..., 3) along Mitsuba's camera axes (left, up, forward) -> along OpenCV's (right, down, forward). Its own inverse."""
+    return np.asarray(vector, dtype=np.float64) @ FLIP_XY[:3, :3]
+
+
 def similarity(rotation, translation, scale=1.0):
     """4x4 float64 with x' = scale * rotation @ x + translation."""
     out = np.eye(4)

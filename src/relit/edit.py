@@ -18,10 +18,12 @@ from relit.asset.asset import load_asset, save_asset
 from relit.asset.gltf import read_asset_file
 from relit.conventions import move_points, scale_of, similarity
 from relit.errors import EXIT_USAGE, UserError
+from relit.files import digests
 from relit.images import read_image, write_srgb
+from relit.materials.plastic_as_gltf import base_colour, diffuse_albedo
 from relit.rendering.mitsuba_scene import build_scene, render
 from relit.rendering.pile import build_pile, instance_ids, joined
-from relit.scene import Asset, Camera, Mesh
+from relit.scene import Asset, Camera, Material, Mesh
 
 RIM = 0.004  # of the photo's longer side: as much around what is removed is rendered too
 
@@ -42,6 +44,7 @@ def edit(
     """Write an asset folder `out` with another material and without the instances `remove` (labels); with `photo`, also the changed photo,
     `out`/photo.png. Returns what was written.
 
+    photo: any of the run's photos, known by its name or its content.
     base_color: (3,) linear, replaces the texture; tint: (3,), multiplies it. roughness, metallic: constants that replace the maps.
     """
     out, asset = Path(out), load_asset(run)
@@ -52,7 +55,7 @@ def edit(
             raise UserError(
                 f"no registered instance has the label {label}", f"labels: {', '.join(map(str, sorted(known)))}", code=EXIT_USAGE
             )
-    material = asset.material
+    material = before = asset.material
     if base_color is not None:
         material = replace(material, base_color=np.broadcast_to(np.float32(base_color), material.base_color.shape).copy())
     if tint is not None:
@@ -60,21 +63,36 @@ def edit(
     for name, value in (("roughness", roughness), ("metallic", metallic)):
         if value is not None:
             material = replace(material, **{name: np.full_like(getattr(material, name), value)})
+    if before.diffuse is not None:
+        material = as_plastic(material, before, tint, base_color is not None, roughness is not None)
     kept = tuple(i for i in asset.instances if i.label not in remove)
     if asset.instances and not any(i.registered for i in kept):
         raise UserError("nothing would be left", fix="keep at least one instance", code=EXIT_USAGE)
     changed = replace(asset, material=material, instances=kept)
     written = [save_asset(out, changed)]
     if photo is not None:
-        camera, picture = _photo(asset, photo)
+        name, camera, picture = _photo(asset, photo)
         before, ids = _rendered(asset, camera, spp, seed)
         after, new_ids = _rendered(changed, camera, spp, seed)
         same = material is asset.material
-        gone = cleared(np.array([i.label for i in asset.instances if i.registered] + [0])[ids], _labels_beside(photo, ids.shape), remove)
+        shown, told = np.array([i.label for i in asset.instances if i.registered] + [0])[ids], _labels_beside(photo, ids.shape)
+        if told is not None and name != asset.cameras[0][0]:
+            told = as_shown(told, shown)
+        gone = cleared(shown, told, remove)
         own = gone if same else gone | (new_ids >= 0)
         write_srgb(out / "photo.png", np.clip(np.where(own[..., None], after, picture + after - before), 0, 1))
         written.append(out / "photo.png")
     return written
+
+
+def as_plastic(material: Material, before: Material, tint: Sequence[float] | None, painted: bool, polished: bool) -> Material:
+    """A changed rough plastic whose diffuse albedo and base colour belong together again. `before`: as it was. painted: the base colour was
+    given. polished: the roughness was."""
+    coat = (material.roughness, material.specular, material.ior)
+    if painted:
+        return replace(material, diffuse=diffuse_albedo(material.base_color, *coat))
+    diffuse = before.diffuse if tint is None else np.clip(before.diffuse * np.float32(tint), 0, 1).astype(np.float32)
+    return replace(material, diffuse=diffuse, base_color=base_colour(diffuse, *coat) if polished else material.base_color)
 
 
 def cleared(shown: np.ndarray, told: np.ndarray | None, remove: Sequence[int]) -> np.ndarray:
@@ -89,6 +107,17 @@ def cleared(shown: np.ndarray, told: np.ndarray | None, remove: Sequence[int]) -
         others = (others | (told > 0)) & ~gone
     rim = binary_dilation(gone, iterations=max(2, round(RIM * max(shown.shape))))
     return gone | (rim & ~others)
+
+
+def as_shown(told: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """The labels (H, W) of a photo that is not the run's first, in the numbers of the run, which are the first photo's: each object takes
+    the number of the instance that the model shows on most of it, 0 where the model shows none on half of it."""
+    out = np.zeros_like(told)
+    for label in np.unique(told[told > 0]):
+        values, counts = np.unique(shown[told == label], return_counts=True)
+        if values[counts.argmax()] > 0 and 2 * counts.max() > counts.sum():
+            out[told == label] = values[counts.argmax()]
+    return out
 
 
 def insert(
@@ -106,7 +135,7 @@ def insert(
     """Put a model (.glb, .gltf, .obj; or an asset folder) into the photo, standing on the ground at pixel `at` (x, y), and write the
     picture `out`.
 
-    size: its bounding sphere, in that of the recovered object. turn: degrees about the vertical.
+    photo: any of the run's photos. size: its bounding sphere, in that of the recovered object. turn: degrees about the vertical.
     """
     asset, out = load_asset(run), Path(out)
     if asset.ground is None or asset.environment is None:
@@ -119,7 +148,7 @@ def insert(
         raise UserError(f"--size {size} is outside 0.01 to 100", code=EXIT_USAGE)
     model = Path(model)
     mesh, material = (lambda a: (a.mesh, a.material))(load_asset(model)) if model.is_dir() else read_asset_file(model)
-    camera, picture = _photo(asset, photo)
+    _, camera, picture = _photo(asset, photo)
     x, y = at
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise UserError(f"--at {x:g},{y:g} lies outside the photo of {camera.width} x {camera.height} pixels", code=EXIT_USAGE)
@@ -198,11 +227,12 @@ def _labels_beside(photo: str | Path, shape: tuple[int, int]) -> np.ndarray | No
     return labels if labels is not None and labels.shape == shape else None
 
 
-def _photo(asset: Asset, photo: str | Path) -> tuple[Camera, np.ndarray]:
-    """The photo's camera and its linear pixels. Raises UserError when they do not belong together."""
+def _photo(asset: Asset, photo: str | Path) -> tuple[str, Camera, np.ndarray]:
+    """Which of the run's photos it is (the name in `asset.cameras`), its camera and its linear pixels. Raises UserError when it is none."""
     if asset.environment is None or not asset.cameras:
         raise UserError("the asset has no camera or no light of its own", fix="give a run of `relit reconstruct`")
-    picture, camera = read_image(Path(photo)).rgb, asset.cameras[0][1]
+    picture = read_image(Path(photo)).rgb
+    name, camera = camera_of(asset, Path(photo))
     h, w = picture.shape[:2]
     if abs(w / h - camera.width / camera.height) > 0.01:
         raise UserError(
@@ -210,7 +240,35 @@ def _photo(asset: Asset, photo: str | Path) -> tuple[Camera, np.ndarray]:
             "it is another photo",
             f"give the photo that the run was made from: {photo}",
         )
-    return camera.resized(w, h), picture
+    return name, camera.resized(w, h), picture
+
+
+def camera_of(asset: Asset, photo: Path) -> tuple[str, Camera]:
+    """(name, camera) of a photo of the run, by the end of its path (of photos of one file name the one whose folders agree furthest), else
+    by its content where the run keeps digests. Raises UserError when it is none of the run's photos."""
+    parts = photo.resolve().parts[::-1]
+
+    def shared(name: str) -> int:
+        return next((k for k, (a, b) in enumerate(zip(Path(name).parts[::-1], parts, strict=False)) if a != b), len(Path(name).parts))
+
+    agree = [shared(name) for name, _ in asset.cameras]
+    best = [c for c, k in zip(asset.cameras, agree, strict=True) if k and k == max(agree)]
+    if len(best) == 1:
+        return best[0]
+    inputs, own = asset.meta.get("inputs") or {}, digests(photo.parent, [photo.name])[photo.name]
+    same = [c for c in best or asset.cameras if inputs.get(c[0]) == own]
+    if same:
+        return same[0]
+    named = ", ".join(name for name, _ in asset.cameras[:6]) + (", ..." if len(asset.cameras) > 6 else "")
+    if best:
+        told = " and ".join(name for name, _ in best)
+        what = f"which of the run's photos this is cannot be told: {told}"
+        raise UserError(what, "they have one name", f"give it as it lies in its folder: {photo}")
+    raise UserError(
+        f"'{photo.name}' is none of the photos whose cameras the run knows",
+        f"those are {named}; under another name it must be the same file",
+        f"give one of them: {photo}",
+    )
 
 
 def _in_range(values: dict[str, float | None]) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
+from relit.capture.flash_energy import flash_photos
 from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError, did_you_mean
 from relit.files import digests
 from relit.log import available_memory, readable_bytes
-from relit.scene import Capture, Sphere
+from relit.scene import Capture, Photo, Sphere
 from relit.settings import read_config, with_values
 
 KINDS = ("multiview", "flash", "duplicates", "collection")
@@ -88,7 +91,8 @@ def open_input(path: Path, job: Job) -> Capture:
         check_labels(path)
     sphere = None if job.sphere is None else Sphere(np.array(job.sphere[:3], dtype=np.float64), float(job.sphere[3]))
     least = {} if job.capture not in RECIPES else {"min_photos": getattr(recipe_of(job.capture), "LEAST_PHOTOS", 3)}
-    return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side, focal=job.focal, **least)
+    labels = job.capture in ("auto", "duplicates")  # who asks for another kind has masks or annotations there, no pile
+    return open_capture(path, sphere=sphere, masks=job.masks, max_side=job.max_side, focal=job.focal, labels=labels, **least)
 
 
 def check_labels(path: Path) -> None:
@@ -109,9 +113,11 @@ def open_as(path: Path, job: Job) -> tuple[Capture, str]:
     """The capture, and its kind: as asked for, else as the layout of the input tells, else multiview."""
     asked = capture_kind(job.capture)
     capture = open_input(path, job)
-    return capture, capture_kind(capture.kind or "multiview") if asked == "auto" else asked
+    kind = capture_kind(capture.kind or "multiview") if asked == "auto" else asked
+    return flash_photos(capture) if kind == "flash" else capture, kind
 
 
+TEXTS = ("_par.txt", "light.txt", "light_offset.txt")  # other texts (notes, a log) decide nothing
 # Folders whose files decide as well.
 BESIDE = (
     "sparse",
@@ -131,17 +137,30 @@ BESIDE = (
 
 def input_digests(capture: Capture) -> dict[str, str]:
     """Content digests of the photos, and of the cameras, masks and normal maps beside them."""
+    from relit.capture.colmap_model import model_folders
+
     root = capture.root if capture.root.is_dir() else capture.root.parent
     files = {root / p.name for p in (*capture.photos, *capture.held_out)}
-    files |= {p for p in root.iterdir() if p.suffix.lower() in (".json", ".txt", ".npz", ".npy", ".bin")}
+    for folder in (root, root / "train", root / "test"):
+        files |= {p for p in folder.glob("*") if p.suffix.lower() in (".json", ".npz", ".npy") or p.name.endswith(TEXTS)}
+    files |= {p for folder in model_folders(root) for p in folder.iterdir() if p.suffix in (".bin", ".txt")}
+    files |= {p for photo in (*capture.photos, *capture.held_out) for p in _read_with(photo)}
     if capture.kind == "duplicates":
         from relit.capture.sfd import SUFFIXES
 
         files |= {p for f in list(files) for p in f.parent.iterdir() if p.stem.endswith((*SUFFIXES, "_normal", "_normal_pretrain"))}
     for folder in BESIDE:
         files |= set((root / folder).rglob("*"))
-    names = sorted(p.relative_to(root).as_posix() for p in files if p.is_file() and p.is_relative_to(root))
+    names = sorted(Path(os.path.relpath(p, root)).as_posix() for p in files if p.is_file())
     return digests(root, names)
+
+
+def _read_with(photo: Photo) -> Iterator[Path]:
+    """The mask and the normal prior that a photo is read with, wherever they lie."""
+    load = photo.load
+    while load is not None:
+        yield from (p for p in (getattr(load, "mask", None), getattr(load, "normal", None)) if isinstance(p, Path))
+        load = getattr(load, "load", None)
 
 
 # ---------------------------------------------------------------- cost

@@ -61,6 +61,10 @@ def reconstruct(
             run.say(f"this run is complete: {asset_folder}")
             return asset_folder
         _begin(run, capture, chosen, cost)
+        if not finished and getattr(options, "check_light", False) and not run.done("volume"):
+            from relit.preflight.light import check_flash_light
+
+            check_flash_light(capture, run.say)
         given = capture  # photos whose cameras are not found are left out of what follows
         if not getattr(recipe, "FINDS_CAMERAS", False):
             capture = with_cameras(capture, run, job)
@@ -119,14 +123,27 @@ def with_cameras(capture: Capture, run: Run, job: Job) -> Capture:
     from relit.cameras.sfm import find_cameras
     from relit.capture import with_grabcut
 
+    focal = _decoded_focal(capture, job.focal)
+
     # the finder keeps its own model in the stage's folder, so a second call after a stop is cheap
     if run.done("cameras"):
-        found, _ = find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=job.focal)
+        found, _ = find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=focal)
         return with_grabcut(found) if job.masks == "grabcut" else found
     with run.stage("cameras", title="cameras from photos") as stage:
-        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=job.focal, say=run.say)
+        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=focal, say=run.say)
     run.say(str(verdict))
     return with_grabcut(found) if job.masks == "grabcut" else found  # it is seeded by the object sphere, so it had to wait for the cameras
+
+
+def _decoded_focal(capture: Capture, focal: float | None) -> float | None:
+    """--focal is in pixels of the files; the finder wants it in those of the photos as decoded (--max-side shrinks them)."""
+    if focal is None:
+        return None
+    from relit.images import read_header
+
+    photo = capture.photos[0]
+    header = read_header(capture.root / photo.name)
+    return focal * max(photo.width, photo.height) / max(header.width, header.height)
 
 
 def _save(run: Run, asset, capture: Capture, kind: str, job: Job, device: str) -> None:

@@ -83,6 +83,8 @@ class Photo:
     name: path relative to the capture's root, as the user knows it.
     camera: the pinhole camera of the decoded (undistorted) image, or None before cameras are found.
     width, height: pixels of the decoded image. focal_hint: focal length in pixels from EXIF, or None.
+    flash_energy: how much light the flash gave for this photo, in any unit that all photos share, 0 where it did not fire; None where
+    the format does not tell.
     """
 
     name: str
@@ -91,6 +93,7 @@ class Photo:
     height: int
     camera: Camera | None = None
     focal_hint: float | None = None
+    flash_energy: float | None = None
 
 
 @dataclass(frozen=True)
@@ -159,6 +162,8 @@ class Material:
     metallic: (H, W) float32 in [0, 1]. ior: index of refraction of the dielectric part; F0 = ((ior-1)/(ior+1))^2.
     specular: (H, W) or (H, W, 3) float32 factor on the dielectric F0 (KHR_materials_specular), or None for 1.
     normal: (H, W, 3) float32 tangent-space normals, or None.
+    diffuse: of a rough plastic (flash captures) its diffuse albedo, (H, W, 3) float32 linear in [0, 1], else None. The plastic is this with
+    alpha = roughness^2 and specular; base_color is then what looks like it under glTF (materials/plastic_as_gltf.py).
     """
 
     base_color: np.ndarray
@@ -167,6 +172,7 @@ class Material:
     ior: float = 1.5
     specular: np.ndarray | None = None
     normal: np.ndarray | None = None
+    diffuse: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,8 @@ def with_values(options, values: dict, source: str):
     try:
         return dataclasses.replace(options, **changes)
     except ValueError as error:  # a recipe's own check
-        raise UserError(f"{source}: {error}", code=EXIT_USAGE) from None
+        why = ", ".join(f"{key} is {getattr(options, key)!r} by default" for key in changes)
+        raise UserError(f"{source}: {error}", why, code=EXIT_USAGE) from None
 
 
 def convert(value, hint):

@@ -62,10 +62,39 @@ def test_a_matcher_links_two_objects(monkeypatch):
 
     monkeypatch.setattr(module, "matches_at", answer)
     features, links = link_by_matcher(None, windows, [camera, camera], 1.0)
-    assert set(links) == {(0, 1)} and isinstance(features[0], Features) and len(calls) > 15
+    assert set(links) == {(0, 1)} and isinstance(features[0], Features) and 15 < len(calls) < 25
+    calls.clear()
+    fine = link_by_matcher(None, windows, [camera, camera], 1.0, step=4)[1]
+    assert {float(t) for t in range(0, 360, 4)} <= set(calls) and len(calls) < 96  # each turn is asked for once
+    assert abs((fine[0, 1].turn + 180) % 360 - 180) < 20 and len(fine[0, 1].a) == len(links[0, 1].a)
     link = links[0, 1]
     assert np.abs(features[0].points[link.a] - seen[0][: len(link.a)]).max() < 1.0
     assert rotation_angle(link.rotation.T @ turns[1] @ turns[0].T) < 1.5
+
+
+def test_the_step_is_a_setting_of_the_recipe(monkeypatch):
+    from types import SimpleNamespace
+
+    import relit.cameras.matcher as module
+    from relit.fit import duplicates_poses
+    from relit.fit.duplicates_options import DuplicatesOptions
+
+    def link(matcher, windows, cameras, error, *, sweep, step):
+        steps.append(step)
+        raise StopIteration
+
+    steps = []
+    view = SimpleNamespace(photo=0, camera=Camera(8, 8, 9.0, 9.0, 4, 4, np.eye(4)), rgb=np.zeros((8, 8, 3)), mask=np.ones((8, 8)))
+    monkeypatch.setattr(module, "link_by_matcher", link)
+    monkeypatch.setattr(module, "load_matcher", lambda name: None)
+    monkeypatch.setattr(duplicates_poses, "all_views", lambda *_: [view])
+    for given, step in (({}, 24), ({"matcher_step": 4}, 4)):
+        with pytest.raises(StopIteration):
+            duplicates_poses.match_instances([(None, view.camera)], None, DuplicatesOptions(matcher="a:b", **given), 0)
+        assert steps.pop() == step
+    for wrong in (0, 7, 100):
+        with pytest.raises(ValueError, match="divisor"):
+            DuplicatesOptions(matcher_step=wrong)
 
 
 def test_matchers_are_loaded_by_name(tmp_path, monkeypatch):

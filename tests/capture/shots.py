@@ -12,6 +12,7 @@ from relit.scene import Camera
 
 BALLS = {(0.6, 0, 0): (1, 0.05, 0.05), (0, 0.6, 0): (0.05, 1, 0.05), (0, 0, 0.6): (0.05, 0.05, 1)}  # centre -> linear colour
 RADIUS = 0.22
+BACKGROUND = (0.3, 0.5, 0.2)  # linear, of photos without masks
 EXTENT = 0.82  # of the three balls about the origin
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from relit.capture import open_capture
+from relit.capture.corrections import FOLDER, save_mask
 from relit.errors import UserError
 from relit.masks.rle import runs_from
 
@@ -234,3 +235,62 @@ def test_principal_point_and_size_of_a_transforms_file(tmp_path):
     (folder / "transforms_train.json").write_text(json.dumps({**data, "w": 2 * W, "h": 2 * H, "cx": 150.0, "cy": 100.0}))
     camera = open_capture(folder).photos[0].camera
     assert (camera.fx, camera.cx, camera.cy) == (123.5 / 2, 75.0, 50.0)
+
+
+# ---------------------------------------------------------------- corrected by hand
+
+
+def corrected(folder, mask):
+    """The capture with a corrected mask of its photo, and its labels before."""
+    before = open_capture(folder)
+    save_mask(folder, before.photos[0], mask.astype(np.float32))
+    return open_capture(folder), before.photos[0].load().labels
+
+
+def test_a_corrected_mask_corrects_the_labels(tmp_path):
+    folder = sfd(tmp_path / "c")
+    mask = labels_of() > 0
+    mask[44:52, 24:36] = False  # taken out of the first object
+    mask[47:50, 96:100] = True  # put in beside the second, whose border is at 96
+    mask[2:6, 150:158] = True  # put in where nothing is near
+    after, labels = corrected(folder, mask)
+    fixed = after.photos[0].load()
+    assert (fixed.labels[44:52, 24:36] == 0).all() and (fixed.labels[47:50, 97:99] == 100).all()
+    assert (fixed.labels[2:6, 150:158] == 0).all() and (fixed.labels != labels).sum() == 8 * 12 + (labels[47:50, 96:100] == 0).sum()
+    assert np.array_equal(fixed.mask > 0, fixed.labels > 0)
+    said = " ".join(after.notes)
+    assert "corrected by hand; 96 pixels were taken out" in said and "32 pixels that were painted in" in said and "not known" in said
+
+
+def test_painting_on_a_smaller_copy_changes_no_border(tmp_path):
+    folder = sfd(tmp_path / "c")
+    small = cv2.resize((labels_of() > 0).astype(np.float32), (W // 2, H // 2), interpolation=cv2.INTER_AREA)
+    small[:, 50:] = 0  # the third object, and a part of the second, go
+    after, labels = corrected(folder, small)
+    fixed = after.photos[0].load().labels
+    assert np.array_equal(fixed[:, :98], labels[:, :98]) and not (fixed[:, 102:] > 0).any()
+    assert "2 objects" in " ".join(after.notes)
+
+
+def test_a_corrected_mask_that_leaves_nothing_or_does_not_fit(tmp_path):
+    folder = sfd(tmp_path / "c")
+    with pytest.raises(UserError, match="leaves no object"):
+        corrected(folder, np.zeros((H, W)))
+    path = next((folder / FOLDER / "masks").iterdir())
+    cv2.imwrite(str(path), np.zeros((200, 40), np.uint8))
+    with pytest.raises(UserError, match="different shapes"):
+        open_capture(folder)
+
+
+def test_objects_that_are_left_out_stay_so_under_a_corrected_mask(tmp_path):
+    """They hide what lies behind them: no background, whatever the mask says."""
+    folder = sfd(tmp_path / "c")
+    labels = labels_of()
+    labels[2:8, 2:8] = 200
+    cv2.imwrite(str(folder / "train" / "000_instance_seg.png"), labels)
+    mask = labels > 150
+    mask = (labels > 0) & ~mask
+    mask[40:44, 24:36] = False
+    after, _ = corrected(folder, mask)
+    fixed = after.photos[0].load().labels
+    assert (fixed[2:8, 2:8] == -1).all() and (fixed[40:44, 24:36] == 0).all()

@@ -74,6 +74,20 @@ def test_broken_camera_files(made, tmp_path, change, message):
         open_capture(tmp_path)
 
 
+def test_offsets_of_pir_and_of_our_own(made, tmp_path):
+    """PIR's file is along Mitsuba's camera axes, left and up; ours says OpenCV's, or before it did so has truth/truth.json beside it."""
+    assert "OpenCV" in (made / "light_offset.txt").read_text().splitlines()[0]
+    (tmp_path / "test").mkdir()
+    (tmp_path / "test" / "light_offset.txt").write_text("0.2 0.1 0.05\n")
+    np.testing.assert_allclose(read_light(tmp_path)[1], [-0.2, -0.1, 0.05])
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "truth.json").write_text("{}")
+    np.testing.assert_allclose(read_light(tmp_path)[1], [0.2, 0.1, 0.05])
+    (tmp_path / "truth" / "truth.json").unlink()
+    (tmp_path / "test" / "light_offset.txt").write_text((made / "light_offset.txt").read_text())
+    np.testing.assert_allclose(read_light(tmp_path)[1], OFFSET, atol=1e-8)
+
+
 def test_light_files(tmp_path):
     assert read_light(tmp_path) == (None, None)
     (tmp_path / "light_offset.txt").write_text("0.1 0.2")

@@ -8,26 +8,12 @@ import shots
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from relit import images
+from relit import cli, images
 from relit.capture import open_capture, opening
 from relit.capture.frames import read_json
 from relit.capture.middlebury import parse
-from relit.errors import EXIT_INPUT, UserError
+from relit.errors import EXIT_INPUT, EXIT_USAGE, UserError
 from relit.scene import Sphere
-
-BACKGROUND = (0.3, 0.5, 0.2)
-
-
-@pytest.fixture
-def cameras():
-    return shots.ring()
-
-
-@pytest.fixture
-def capture_folder(tmp_path, cameras):
-    names = shots.write_photos(tmp_path / "images", cameras, background=BACKGROUND)
-    shots.write_transforms(tmp_path, cameras, [f"images/{n}" for n in names])
-    return tmp_path
 
 
 def refused(path, match, **options):
@@ -60,10 +46,19 @@ def test_one_image(tmp_path):
     refused(tmp_path, "1 photo is not enough: at least 3")
 
 
+@pytest.mark.parametrize("side", [-5, 0, 15])
+def test_photos_cannot_be_shrunk_to_nothing(capture_folder, capsys, side):
+    with pytest.raises(UserError, match=f"cannot be shrunk to {side} pixels") as caught:
+        open_capture(capture_folder, max_side=side)
+    assert caught.value.code == EXIT_USAGE and "at least 16" in caught.value.why and caught.value.fix
+    assert cli.main(["inspect", str(capture_folder), "--max-side", str(side)]) == EXIT_USAGE
+    assert "at least 16" in capsys.readouterr().err
+
+
 def test_mixed_sizes(tmp_path, cameras):
-    shots.write_photos(tmp_path / "images", [cameras[0], cameras[1].resized(90, 70), *cameras[2:]], background=BACKGROUND)
+    shots.write_photos(tmp_path / "images", [cameras[0], cameras[1].resized(90, 70), *cameras[2:]], background=shots.BACKGROUND)
     assert any("2 sizes (5 of 72 x 56, 1 of 90 x 70)" in n for n in open_capture(tmp_path).notes)
-    shots.write_photos(tmp_path / "images", [cameras[0].resized(56, 72)], background=BACKGROUND)
+    shots.write_photos(tmp_path / "images", [cameras[0].resized(56, 72)], background=shots.BACKGROUND)
     names = [f"images/{i:03d}.png" for i in range(6)]
     shots.write_transforms(tmp_path, cameras, names)
     refused(tmp_path, "different shapes: 72 x 56 and 56 x 72")
@@ -185,12 +180,12 @@ def test_grabcut_on_request(capture_folder, cameras):
 
 
 def test_truncated_jpeg_and_nan(tmp_path):
-    shots.write_photos(tmp_path, shots.ring(4), suffix=".jpg", background=BACKGROUND)
+    shots.write_photos(tmp_path, shots.ring(4), suffix=".jpg", background=shots.BACKGROUND)
     whole = (tmp_path / "002.jpg").read_bytes()
     (tmp_path / "002.jpg").write_bytes(whole[: len(whole) // 2])
     refused(tmp_path, "cannot be read")
     exr = tmp_path / "exr"
-    shots.write_photos(exr, shots.ring(4), suffix=".exr", background=BACKGROUND)
+    shots.write_photos(exr, shots.ring(4), suffix=".exr", background=shots.BACKGROUND)
     images.write_linear(exr / "001.exr", np.full((56, 72, 3), np.inf))
     refused(exr, "NaN or infinite")
 
@@ -242,7 +237,7 @@ KEYS = ["fl_x", "fl_y", "cx", "w", "h", "k1", "p1", "camera_angle_x", "camera_mo
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_json_is_read_or_refused(tmp_path, head, first):
     if not (tmp_path / "images").exists():
-        shots.write_photos(tmp_path / "images", shots.ring(3), background=BACKGROUND)
+        shots.write_photos(tmp_path / "images", shots.ring(3), background=shots.BACKGROUND)
     cameras = shots.ring(3)
     shots.write_transforms(tmp_path, cameras, [f"images/{i:03d}.png" for i in range(3)])
 

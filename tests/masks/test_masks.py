@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from relit.cameras.se3 import look_at
 from relit.errors import EXIT_ENVIRONMENT, UserError
@@ -92,6 +93,24 @@ def test_judgement_of_masks():
         files.judge({"a": good, "b": good, "c": good, "d": 1 - good, "e": 1 - good}, "masks/")
     with pytest.raises(UserError, match="2 of 3 masks are black"):
         files.judge({"a": good, "b": black, "c": black}, "masks/")
+
+
+@pytest.mark.parametrize(
+    "colours, expected",
+    [
+        ([(0, 0, 0), (128, 0, 0), (0, 128, 0)], [0, 1, 1]),  # DAVIS, VOC: one dark colour for each object
+        ([(0, 0, 0), (1, 1, 1), (2, 2, 2)], [0, 1, 1]),  # the numbers of the objects as grey levels
+        ([(0, 0, 0), (51, 51, 51), (255, 255, 255)], [0, 0.2, 1]),  # a soft mask with a palette of greys
+        ([(255, 255, 255), (0, 0, 0), (51, 51, 51)], [1, 0, 0.2]),  # in another order
+    ],
+)
+def test_masks_with_a_palette(tmp_path, colours, expected):
+    index = RNG.integers(0, 3, (60, 80)).astype(np.uint8)
+    index[0, :3] = 0, 1, 2
+    picture = Image.fromarray(index, "P")
+    picture.putpalette([v for c in colours for v in c])
+    picture.save(tmp_path / "a.png")
+    np.testing.assert_allclose(files.read_mask(tmp_path / "a.png"), np.array(expected)[index], atol=1e-6)
 
 
 def test_a_missing_segmenter_says_what_to_install(monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from relit.scene import Sphere
 from relit.viewer.correct import correction_server
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from test_faults import black_masks, photos_only, write_capture
+from test_faults import black_masks, photos_only, picture, write_capture
 
 
 @pytest.fixture
@@ -71,6 +72,19 @@ def test_a_corrected_photo_is_not_left_out(capture):
     assert len(open_capture(capture).photos) == 5
     save_mask(capture, first, disc(24, 24, 12))
     assert len(open_capture(capture).photos) == 6
+
+
+def test_grabcut_leaves_a_corrected_mask_alone(capture):
+    """Also of a photo that was undistorted since, as it is when its camera was found from the photos."""
+    from relit.capture.opening import with_grabcut
+    from relit.capture.photo import with_camera
+
+    save_mask(capture, open_capture(capture).photos[0], disc(20, 24, 6))
+    opened = open_capture(capture)
+    bent = [with_camera(p, replace(p.camera, distortion=(0.01, 0, 0, 0))) for p in opened.photos]
+    masks = [p.load().mask for p in with_grabcut(replace(opened, photos=tuple(bent))).photos]
+    h, w = masks[0].shape
+    assert np.abs(masks[0] - disc(20, 24, 6)[:h, :w]).mean() < 0.03 and masks[1].sum() > 2 * masks[0].sum()
 
 
 def test_shapes_and_files_that_do_not_fit(capture):
@@ -157,6 +171,53 @@ def test_boxes_without_cameras(built, capture):
         server.server_close()
 
 
+def test_a_box_gives_a_mask_without_cameras(built, capture):
+    """GrabCut needs the box alone."""
+    photos_only(capture)
+    for i in range(6):
+        rgb = np.array(cv2.imread(str(capture / f"images/p{i}.png")), np.uint8)
+        around = np.random.default_rng(i).integers(90, 110, rgb.shape, dtype=np.uint8)  # grey, and no backdrop that a threshold finds
+        around[:24] += 60
+        cv2.imwrite(str(capture / f"images/p{i}.png"), np.where(picture(i)[..., 3:] > 127, picture(i)[..., 2::-1], around))
+    opened = open_capture(capture)
+    assert not opened.has_cameras
+    server = serve(lambda: correction_server(opened))
+    own = {"Origin": server.url.rstrip("/")}
+    try:
+        state = json.loads(ask(server, "/manifest.json")[1])
+        assert state["cut"] is True and state["boxes"] is False
+        for bad in ([10, 10, 11, 11], [0, 0, 48, 48]):
+            code, said, _ = ask(server, "/cut", "POST", json.dumps({"i": 0, "box": bad}).encode(), **own)
+            assert code == 422 and "the box is too small" in json.loads(said)["error"]
+        for i in range(6):
+            y, x = np.nonzero(picture(i)[..., 3] > 127)
+            box = [int(x.min()) - 2, int(y.min()) - 2, int(x.max()) + 3, int(y.max()) + 3]
+            assert ask(server, "/cut", "POST", json.dumps({"i": i, "box": box}).encode(), **own)[0] == 200
+    finally:
+        server.shutdown()
+        server.server_close()
+    for i, photo in enumerate(open_capture(capture).photos):
+        found, true = photo.load().mask > 0.5, picture(i)[..., 3] > 127
+        assert (found & true).sum() / (found | true).sum() > 0.85
+
+
+def test_a_pile_has_no_box(built, tmp_path):
+    labels = np.zeros((96, 160), np.uint8)
+    for k in range(3):
+        cv2.circle(labels, (30 + 48 * k, 48), 18, 60 + 40 * k, -1)
+    cv2.imwrite(str(tmp_path / "pile.png"), np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "pile_labels.png"), labels)
+    server = serve(lambda: correction_server(open_capture(tmp_path)))
+    try:
+        assert json.loads(ask(server, "/manifest.json")[1])["cut"] is False
+        body, own = json.dumps({"i": 0, "box": [9, 9, 40, 40]}).encode(), {"Origin": server.url.rstrip("/")}
+        code, said, _ = ask(server, "/cut", "POST", body, **own)
+        assert code == 422 and "no single box" in json.loads(said)["error"]
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
 def test_painting_in_the_page(drive, capture, tmp_path):
     before = open_capture(capture)
     server = serve(lambda: correction_server(before))
@@ -189,6 +250,11 @@ def test_painting_in_the_page(drive, capture, tmp_path):
                 {"click": "#save-boxes"},
                 {"wait": "document.getElementById('message').textContent.includes('sphere was saved')"},
                 {"eval": "relit.edit.boxes.size"},
+                {"click": '[data-photo="4"]'},
+                {"wait": "relit.edit.i === 4"},
+                {"drag": [0.1, 0.1, 0.9, 0.9]},
+                {"click": "#cut"},
+                {"wait": "document.getElementById('message').textContent === 'the mask in the box was saved'"},
             ],
         )
     finally:
@@ -201,6 +267,8 @@ def test_painting_in_the_page(drive, capture, tmp_path):
     assert painted[:26, :6].mean() > 0.8 and np.abs(painted[:, 14:]).max() < 0.02
     assert np.abs(after.photos[1].load().mask - before.photos[1].load().mask).max() < 0.02  # undone
     assert np.linalg.norm(after.sphere.centre) < 0.2
+    cut, true = after.photos[4].load().mask > 0.5, before.photos[4].load().mask > 0.5
+    assert (cut & true).sum() / (cut | true).sum() > 0.85
 
 
 def test_a_capture_of_black_masks_can_be_mended(capture):

@@ -118,6 +118,16 @@ export async function edit(manifest, panel) {
     draw();
     return true;
   });
+  const cutBox = guarded(async () => {
+    const box = state.boxes.get(state.i);
+    if (!box) throw new Error("draw a box round the object first");
+    await post("cut", JSON.stringify({ i: state.i, box }));
+    state.dirty = false;
+    mark(true);
+    await open(state.i);
+    say("the mask in the box was saved");
+    return true;
+  });
   function mark(on) {
     manifest.photos[state.i].corrected = on;
     buttons[state.i].lastChild.textContent = `${on ? "✓ " : ""}${manifest.photos[state.i].name}`;
@@ -130,12 +140,13 @@ export async function edit(manifest, panel) {
 
   const buttons = manifest.photos.map((p, i) => element("button", { "data-photo": i, title: p.name, onclick: () => open(i) },
     element("img", { src: `photo.jpg?i=${i}`, alt: "", loading: "lazy" }), element("span", {}, `${p.corrected ? "✓ " : ""}${p.name}`)));
-  const tools = [["paint", "add to the object"], ["erase", "take away"], ...(manifest.boxes ? [["box", "box round the object"]] : [])];
+  const tools = [["paint", "add to the object"], ["erase", "take away"], ...(manifest.boxes || manifest.cut ? [["box", "box round the object"]] : [])];
   panel.append(
     group("Mask", element("p", {}, "Blue is off the object. What is saved counts when the capture is opened the next time."),
       choice("tool", "tool", tools, (v) => { state.tool = v; }),
       slider("brush", "brush", { min: 2, max: 120, step: 1, value: state.size }, (v) => `${v} px`, (v) => { state.size = v; }),
       element("button", { id: "undo", onclick: undo }, "undo (Ctrl+Z)"),
+      ...(manifest.cut ? [element("button", { id: "cut", onclick: cutBox }, "mask from the box")] : []),
       element("button", { id: "save", onclick: save }, "save this mask"),
       element("button", { id: "forget", onclick: forget }, "back to the automatic mask")),
     ...(manifest.boxes ? [group("Object sphere", element("p", {}, "Draw boxes in two photos from different sides."),

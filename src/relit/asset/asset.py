@@ -1,10 +1,11 @@
 """The asset folder: what `reconstruct` leaves and everything after it reads.
 
     asset.json  object.glb  textures/{base_color,roughness,metallic,specular,normal}.png  cameras.json  lights/environment.{exr,hdr}
-    lights/flash.json
+    lights/flash.json  textures/diffuse_albedo.exr
 
 Nothing in it is absolute: the folder can be moved. `object.glb` is the one source of shape and material; `textures/` holds copies of
-its images for other tools.
+its images for other tools. One thing a GLB cannot say: of a rough plastic the base colour in it is what looks like the diffuse albedo
+under glTF, and the diffuse albedo itself is textures/diffuse_albedo.exr (`diffuse_albedo` in asset.json names it).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import os
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +22,17 @@ import numpy as np
 from relit.asset.colmap_text import write_colmap
 from relit.asset.gltf import read_asset_file, write_glb
 from relit.asset.instances import read_instances, write_instances
+from relit.asset.mitsuba_plastic import DIFFUSE
 from relit.conventions import world_from_cv_camera, world_from_gl_camera
 from relit.errors import EXIT_ENVIRONMENT, UserError
 from relit.images import read_image, write_data, write_linear, write_srgb
 from relit.lighting.flash import flash_json, read_flash
+from relit.materials.plastic_as_gltf import base_colour
 from relit.scene import Asset, Camera, Material
 
 SCHEMA = 1
 MAX_JSON = 64 << 20  # bytes
-RESERVED = ("schema", "world_from_asset")
+RESERVED = ("schema", "world_from_asset", "diffuse_albedo")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
@@ -110,7 +114,8 @@ def find_asset(folder_or_run: str | Path) -> Path:
 
 
 def save_textures(folder: Path, material: Material) -> None:
-    """Write the maps of a material as 8-bit PNGs: base_color in sRGB, the others without a curve (normal as (n + 1) / 2)."""
+    """Write the maps of a material as 8-bit PNGs: base_color in sRGB, the others without a curve (normal as (n + 1) / 2);
+    the diffuse albedo of a rough plastic as linear EXR."""
     folder.mkdir(parents=True, exist_ok=True)
     write_srgb(folder / "base_color.png", material.base_color)
     write_data(folder / "roughness.png", material.roughness)
@@ -119,6 +124,8 @@ def save_textures(folder: Path, material: Material) -> None:
         write_data(folder / "specular.png", material.specular)
     if material.normal is not None:
         write_data(folder / "normal.png", np.asarray(material.normal) * 0.5 + 0.5)
+    if material.diffuse is not None:
+        write_linear(folder / DIFFUSE, material.diffuse)
 
 
 def save_asset(folder: str | Path, asset: Asset) -> Path:
@@ -130,6 +137,8 @@ def save_asset(folder: str | Path, asset: Asset) -> Path:
     if taken:
         raise ValueError(f"asset.meta must not hold {taken}")
     head = {"schema": SCHEMA, "world_from_asset": np.asarray(asset.world_from_asset, np.float64).tolist(), **asset.meta}
+    if asset.material.diffuse is not None:
+        head["diffuse_albedo"] = f"textures/{DIFFUSE}"
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         new = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -206,4 +215,19 @@ def load_asset(folder_or_run: str | Path) -> Asset:
     lights = tuple(read_image(f).rgb for f in files) if files and all(f.is_file() for f in files) else ()
     meta = {k: v for k, v in head.items() if k not in RESERVED}
     instances, ground = read_instances(folder)
+    material = _with_diffuse(material, head, folder)
     return Asset(mesh, material, world_from_asset, environment, cameras, meta, flash, instances, ground, lights)
+
+
+def _with_diffuse(material: Material, head: dict, folder: Path) -> Material:
+    """The material as the GLB tells it, with the diffuse albedo of a rough plastic."""
+    if "diffuse_albedo" in head:
+        file = folder / "textures" / DIFFUSE
+        if not file.is_file():
+            why = "a flash capture's diffuse albedo is not in the GLB"
+            raise UserError("textures/diffuse_albedo.exr is missing", why, f"put it back, or reconstruct again: {folder}")
+        return replace(material, diffuse=read_image(file).rgb)
+    if head.get("material") != "rough_plastic":
+        return material
+    diffuse = material.base_color  # Relit up to 0.1 wrote the diffuse albedo itself as base colour
+    return replace(material, diffuse=diffuse, base_color=base_colour(diffuse, material.roughness, material.specular, material.ior))

@@ -16,11 +16,13 @@ from relit.lighting.flash import flash_position
 from relit.scene import Asset, Material
 
 LEVELS = 5
+DIFFUSE = "diffuse_albedo.exr"
 EVEN = 0.02  # a relative range of alpha below which one plastic is enough
 
 
 def plastic_bsdf(folder: Path, material: Material) -> list[str]:
-    """Lines of the BSDF; writes textures/specular.exr and the blend's weights. The base colour is there already."""
+    """Lines of the BSDF; writes textures/specular.exr and the blend's weights. The diffuse albedo is there already."""
+    diffuse = "base_color.png" if material.diffuse is None else DIFFUSE
     specular = np.ones((1, 1), np.float32) if material.specular is None else np.asarray(material.specular, np.float32)
     specular = specular[..., None].repeat(3, -1) if specular.ndim == 2 else specular
     write_linear(folder / "textures" / "specular.exr", specular)
@@ -29,22 +31,22 @@ def plastic_bsdf(folder: Path, material: Material) -> list[str]:
     count = LEVELS if high > low * (1 + EVEN) else 1
     levels = np.linspace(low, high, count) if count > 1 else [float(alpha.mean())]
     place = (alpha - low) / max(high - low, 1e-9) * (count - 1)
-    lines = _plastic(levels[-1], material.ior)
+    lines = _plastic(levels[-1], material.ior, diffuse)
     for k in reversed(range(count - 1)):
         write_data(folder / "textures" / f"wider_{k}.png", np.clip(place - k, 0, 1))
         file = f'<string name="filename" value="textures/wider_{k}.png"/>'
         weight = f'<texture type="bitmap" name="weight">{file}<boolean name="raw" value="true"/></texture>'
-        lines = ['<bsdf type="blendbsdf">', weight, *_plastic(levels[k], material.ior), *lines]
+        lines = ['<bsdf type="blendbsdf">', weight, *_plastic(levels[k], material.ior, diffuse), *lines]
         lines.append("</bsdf>")
     return lines
 
 
-def _plastic(alpha: float, ior: float) -> list[str]:
+def _plastic(alpha: float, ior: float, diffuse: str) -> list[str]:
     return [
         '<bsdf type="roughplastic">',
         '<string name="distribution" value="ggx"/>',
         f'<float name="alpha" value="{alpha:.6g}"/><float name="int_ior" value="{ior:.6g}"/><float name="ext_ior" value="1"/>',
-        '<texture type="bitmap" name="diffuse_reflectance"><string name="filename" value="textures/base_color.png"/></texture>',
+        f'<texture type="bitmap" name="diffuse_reflectance"><string name="filename" value="textures/{diffuse}"/></texture>',
         '<texture type="bitmap" name="specular_reflectance"><string name="filename" value="textures/specular.exr"/>'
         '<boolean name="raw" value="true"/></texture>',
         "</bsdf>",

@@ -6,8 +6,9 @@
         return points_a, points_b       # (M, 2) each: corresponding positions in pixels, centres at +.5
 
 ALIKED with LightGlue, or any other network, fits behind such a function of a few lines (docs/duplicates.md). Objects in a pile are turned
-against each other about the line of sight, so the second picture of each pair is turned before (SfD Sec. 3.1): in steps of STEP degrees,
-the counts are smoothed over neighbouring turns, and the correspondences of the best turn are carried back.
+against each other about the line of sight, so the second picture of each pair is turned before (SfD Sec. 3.1): in steps of `step` degrees,
+the counts are smoothed over neighbouring turns, and the correspondences of the best turn are carried back. SfD's steps are of 4 degrees, 90
+calls a pair; steps of STEP, and FINE to both sides of the best, are 17, and a network is seldom so fast that 90 are borne.
 """
 
 from __future__ import annotations
@@ -90,14 +91,18 @@ def matches_at(matcher: Matcher, a: np.ndarray, b: np.ndarray, degrees: float) -
 
 
 def link_by_matcher(
-    matcher: Matcher, windows: list[tuple], cameras: list[Camera], error: float, *, sweep: bool = True
+    matcher: Matcher, windows: list[tuple], cameras: list[Camera], error: float, *, sweep: bool = True, step: int = STEP
 ) -> tuple[list[Features], dict[tuple[int, int], Link]]:
-    """As `find_features` and `link_instances` together. windows: (rgb, mask, offset in the photo) of each instance."""
+    """As `find_features` and `link_instances` together. windows: (rgb, mask, offset in the photo) of each instance. step: degrees of the
+    sweep, a divisor of 360; FINE degrees to both sides of the best turn are tried where steps are longer."""
     pictures = [shown(rgb, mask) for rgb, mask, _ in windows]
     points: list[list] = [[] for _ in windows]
 
     def photo_points(k: int, p: np.ndarray) -> np.ndarray:
         return p / pictures[k][1] + np.asarray(windows[k][2])
+
+    def count(i: int, j: int, degrees: float) -> int:
+        return len(matches_at(matcher, pictures[i][0], pictures[j][0], degrees)[0])
 
     def link_at(i: int, j: int, degrees: float) -> tuple[Link | None, np.ndarray, np.ndarray]:
         p, q = matches_at(matcher, pictures[i][0], pictures[j][0], degrees)
@@ -112,11 +117,12 @@ def link_by_matcher(
     for i, j in combinations(range(len(windows)), 2):
         best = 0.0
         if sweep:
-            turns = np.arange(0, 360, STEP, dtype=float)
-            counts = np.array([len(matches_at(matcher, pictures[i][0], pictures[j][0], t)[0]) for t in turns], float)
+            turns = np.arange(0, 360, step, dtype=float)
+            counts = np.array([count(i, j, t) for t in turns], float)
             best = turns[np.argmax(sum(np.roll(counts, k) for k in (-1, 0, 1)))]
-            tries = [best, best - FINE, best + FINE]
-            best = max(tries, key=lambda t: len(matches_at(matcher, pictures[i][0], pictures[j][0], t)[0]))
+            tries = [best, best - FINE, best + FINE] if step > FINE else [best - step, best, best + step]
+            found = {t % 360: n for t, n in zip(turns, counts, strict=True)}  # what was counted is not asked again
+            best = max(tries, key=lambda t: found[t % 360] if t % 360 in found else count(i, j, t))
         link, p, q = link_at(i, j, best)
         if link is None:
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -80,11 +81,14 @@ def read(path: Path, found: Path) -> Reading:
 
 
 def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
-    base = next((root / n for n in IMAGE_FOLDERS if (root / n).is_dir()), root)
-    by_name = {f.name: f for f in sorted(base.rglob("*")) if f.suffix.lower() in EXTENSIONS}
-    by_stem = {f.stem: f for f in by_name.values()}
-    frames, missing = [], []
+    # the images beside the model (dense/images with dense/sparse) before those of the folder that was opened
+    places = [p for p in dict.fromkeys((folder.parent, folder.parent.parent, root)) if p.is_relative_to(root)]
+    base = next((p / n for p in places for n in IMAGE_FOLDERS if (p / n).is_dir()), root)
     images = [model.image(i) for i in model.reg_image_ids()]
+    named = {inside(base, i.name, folder) for i in images}  # these belong to their own cameras
+    spare = [f for f in sorted(base.rglob("*")) if f.suffix.lower() in EXTENSIONS and f not in named]
+    by_name, by_stem = _unique(spare, "name"), _unique(spare, "stem")
+    frames, missing = [], []
     for image in sorted(images, key=lambda i: i.name):
         file = inside(base, image.name, folder)
         file = file if file.is_file() else by_name.get(Path(image.name).name) or by_stem.get(Path(image.name).stem)
@@ -105,6 +109,12 @@ def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
     if missing:
         notes.append(f"{len(missing)} photos of the COLMAP model are not there and were left out, for example {missing[0]}")
     return frames
+
+
+def _unique(files: list[Path], key: str) -> dict[str, Path]:
+    """name or stem -> file, of those that only one file has."""
+    counts = Counter(getattr(f, key) for f in files)
+    return {getattr(f, key): f for f in files if counts[getattr(f, key)] == 1}
 
 
 def is_pose(camera: Camera) -> bool:

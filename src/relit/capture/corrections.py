@@ -2,7 +2,8 @@
 
     CAPTURE/relit-corrections/  masks/NAME.png (white on the object, of the photo as Relit shows it: upright, undistorted)  sphere.json
 
-A corrected mask wins over every other source of masks; a sphere given on the command line wins over the corrected one.
+A corrected mask wins over every other source of masks; a sphere given on the command line wins over the corrected one. Of a photo of
+duplicates it corrects the labels, see `corrected_labels`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from urllib.parse import quote, unquote
 
 import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from relit.errors import UserError
 from relit.files import disk_errors, read_json, write_text
@@ -22,6 +24,7 @@ from relit.images import read_data, write_data
 from relit.scene import Camera, Photo, Pixels, Sphere
 
 FOLDER = "relit-corrections"
+REACH = 0.01  # of the longer side of a photo of duplicates: so far from an object a pixel that was painted in belongs to it
 
 
 @dataclass(frozen=True)
@@ -33,22 +36,60 @@ class Corrected:
 
     def __call__(self) -> Pixels:
         pixels = self.load()
-        h, w = pixels.rgb.shape[:2]
-        mask = _read(self.path)
-        if abs(mask.shape[1] / mask.shape[0] - w / h) > 0.02 * (w / h):
-            raise UserError(
-                f"a corrected mask and its photo have different shapes: {mask.shape[1]} x {mask.shape[0]} and {w} x {h} pixels",
-                "the photo was replaced or turned since",
-                f"correct it again, or remove the file: {self.path}",
-            )
-        if mask.shape != (h, w):
-            mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA if mask.shape[0] > h else cv2.INTER_LINEAR)
-        return replace(pixels, mask=np.ascontiguousarray(mask, np.float32))
+        mask = _read(self.path, pixels.rgb.shape[:2])
+        return replace(pixels, mask=_sized(mask, pixels.rgb.shape[:2]))
 
 
-def _read(path: Path) -> np.ndarray:
+def _read(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """The mask in [0, 1] at the size it was painted at. Raises UserError where a photo of `shape` has other proportions."""
     mask = read_data(path)
-    return mask if mask.ndim == 2 else mask[..., 0]
+    mask = np.ascontiguousarray(mask if mask.ndim == 2 else mask[..., 0], np.float32)
+    h, w = shape
+    if abs(mask.shape[1] / mask.shape[0] - w / h) > 0.02 * (w / h):
+        raise UserError(
+            f"a corrected mask and its photo have different shapes: {mask.shape[1]} x {mask.shape[0]} and {w} x {h} pixels",
+            "the photo was replaced or turned since",
+            f"correct it again, or remove the file: {path}",
+        )
+    return mask
+
+
+def _sized(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The mask at another size (H, W)."""
+    if mask.shape == shape:
+        return mask
+    return cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_AREA if mask.shape[0] > shape[0] else cv2.INTER_LINEAR)
+
+
+def corrected_labels(labels: np.ndarray, root: Path, name: str) -> tuple[np.ndarray, list[str]]:
+    """The labels (H, W) of a photo of duplicates, positive on objects, as its corrected mask wants them, and notes that say so.
+
+    What was taken out of the mask is background. What was put in goes to the nearest object within REACH of the longer side; farther away
+    it cannot be told whose it is, and it stays what it was. Pixels that were not painted keep their labels, and so do objects that are left
+    out (negative).
+    """
+    path = corrected_masks(root).get(name)
+    if path is None:
+        return labels, []
+    painted = _read(path, labels.shape)
+    on = labels > 0
+    # painted on a smaller copy: what that alone does to the borders is no correction
+    before = _sized(_sized(on.astype(np.float32), painted.shape), labels.shape) > 0.5
+    after = _sized(painted, labels.shape) > 0.5
+    out, into = before & ~after & on, after & ~before & (labels == 0)
+    if not (on & ~out).any():
+        raise UserError("a corrected mask leaves no object", "all labels lie off it", f"correct it again, or remove the file: {path}")
+    reach = max(4.0, REACH * max(labels.shape))
+    away, nearest = distance_transform_edt(~(on & ~out), return_indices=True)
+    given = into & (away <= reach)
+    fixed = np.where(out, 0, np.where(given, labels[tuple(nearest)], labels))
+    notes = [f"{FOLDER}/: the mask was corrected by hand; {out.sum()} pixels were taken out, {given.sum()} went to the nearest object"]
+    if refused := int((into & ~given).sum()):
+        notes.append(
+            f"{FOLDER}/: {refused} pixels that were painted in lie more than {reach:.0f} pixels from every object: whose they are is not "
+            "known, and they are not used; a new object needs a label of its own"
+        )
+    return fixed.astype(labels.dtype), notes
 
 
 def _file_of(name: str) -> str:

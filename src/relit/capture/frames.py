@@ -11,12 +11,13 @@ import numpy as np
 
 from relit.cameras.pinhole import Lens
 from relit.cameras.se3 import nearest_rotation
-from relit.errors import UserError
+from relit.errors import EXIT_USAGE, UserError
 from relit.images import EXTENSIONS
 from relit.masks.rle import Runs
 from relit.scene import Camera, Sphere
 
 MAX_TEXT = 256 * 2**20  # bytes of a camera file; larger ones are not camera files
+LEAST_SIDE = 16  # pixels that --max-side may ask for
 IMAGE_FOLDERS = ("images", "image", "rgb", "input", "photos")
 NOT_PHOTOS = ("_mask", ".mask", "_normal", "_depth", "_alpha", "_seg")  # ends of the stems of files that lie beside the photos
 
@@ -27,7 +28,7 @@ class Frame:
 
     name: relative to the capture's root, as the user knows it. camera: in pixels of the calibration (the file may be a resized copy), its
     `distortion` filled for OpenCV's model. lens: any other lens, or None. mask: a mask file that the format names, or None. runs: a
-    mask that the format itself holds, or None.
+    mask that the format itself holds, or None. flash_energy: see `scene.Photo`.
     """
 
     path: Path
@@ -37,6 +38,7 @@ class Frame:
     mask: Path | None = None
     held_out: bool = False
     runs: Runs | None = None
+    flash_energy: float | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,13 @@ def list_images(folder: Path) -> list[Path]:
 def image_folder(root: Path) -> Path | None:
     """The folder of the photos of a capture: images/, image/, ... or the root itself; None when none holds a photo."""
     return next((d for d in (*(root / n for n in IMAGE_FOLDERS), root) if list_images(d)), None)
+
+
+def check_max_side(max_side: int | None) -> None:
+    """Raises UserError (code 2) for a size at which nothing is left of a photo."""
+    if max_side is not None and max_side < LEAST_SIDE:
+        what = f"the photos cannot be shrunk to {max_side} pixels"
+        raise UserError(what, f"--max-side is at least {LEAST_SIDE}", "use --max-side 800, or leave it out", code=EXIT_USAGE)
 
 
 def inside(root: Path, name: str, source: Path) -> Path:

@@ -2,6 +2,8 @@
 
 scale_mat carries the unit sphere that holds the object into the world. Pixel centres lie at whole numbers (the loaders of IDR and
 NeuS sample rays there), so half a pixel is added to the principal point. Photos are matched to matrices by their order of name.
+
+WildLight writes besides light_energy_i, the energy of the flash in three channels; where some photos have it, the others had no flash.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ def read(path: Path, found: Path) -> Reading:
     """Read the camera file. The frame is the world's; the object sphere is scale_mat's."""
     try:
         with np.load(found, allow_pickle=False) as data:
-            arrays = {k: data[k] for k in data.files if k.startswith(("world_mat_", "scale_mat_")) and "inv" not in k}
+            arrays = {k: data[k] for k in data.files if k.startswith(("world_mat_", "scale_mat_", "light_energy_")) and "inv" not in k}
     except NO_ARRAYS as error:
         raise UserError("a camera file cannot be read", str(error), f"write it again: {found}") from error
     indices = sorted(int(k[10:]) for k in arrays if k.startswith("world_mat_") and k[10:].isdigit())
@@ -44,6 +46,7 @@ def read(path: Path, found: Path) -> Reading:
             f"each world_mat_i belongs to the i-th photo by name in {folder.name if folder else 'image'}/",
             f"add or remove photos until the numbers agree: {found}",
         )
+    energies = flash_energies(arrays, indices, found)
     frames = []
     for index, file in zip(indices, files, strict=True):
         world_mat = arrays[f"world_mat_{index}"]
@@ -52,7 +55,7 @@ def read(path: Path, found: Path) -> Reading:
         k, pose = decompose_projection(world_mat[:3], f"world_mat_{index}", found)
         header = read_header(file)
         camera = Camera(header.width, header.height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose)
-        frames.append(Frame(file, file.relative_to(found.parent).as_posix(), camera))
+        frames.append(Frame(file, file.relative_to(found.parent).as_posix(), camera, flash_energy=energies.get(index)))
     scale_mat = arrays.get(f"scale_mat_{indices[0]}")
     sphere = None
     if scale_mat is not None:
@@ -60,6 +63,20 @@ def read(path: Path, found: Path) -> Reading:
             raise UserError(f"scale_mat_{indices[0]} is not a similarity", "it must scale evenly and move", f"write it again: {found}")
         sphere = Sphere(scale_mat[:3, 3].astype(np.float64), scale_of(scale_mat))
     return Reading("idr", found.parent, tuple(frames), sphere=sphere)
+
+
+def flash_energies(arrays: dict[str, np.ndarray], indices: list[int], source: Path) -> dict[int, float]:
+    """Mean over the channels of light_energy_i for each photo, 0 where the file has none for it; nothing where it has none at all."""
+    if not any(k.startswith("light_energy_") for k in arrays):
+        return {}
+    out = {}
+    for index in indices:
+        energy = np.asarray(arrays.get(f"light_energy_{index}", 0.0))
+        if energy.dtype.kind not in "fiu" or not energy.size or not np.isfinite(energy).all() or (energy < 0).any():
+            why = "it must be finite and not negative"
+            raise UserError(f"light_energy_{index} is not the energy of a flash", why, f"write it again: {source}")
+        out[index] = float(energy.mean())
+    return out
 
 
 def decompose_projection(p: np.ndarray, what: str, source: Path) -> tuple[np.ndarray, np.ndarray]:

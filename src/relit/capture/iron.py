@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from relit.capture.frames import Frame, Reading, list_images, pose_from, read_json, read_text
+from relit.conventions import cv_from_mitsuba_axes
 from relit.errors import UserError
 from relit.scene import Camera, Sphere
 
+AXES = "# OpenCV camera axes: right, down, forward"  # the first line of our own light_offset.txt
 NAME = "cam_dict_norm.json"
 LOOKED_FOR = f"{NAME} (IRON, PIR)"
 IN_VIEW = 0.9  # share of the cameras that must have the unit sphere's centre in the picture
@@ -84,18 +86,26 @@ def _sees_origin(camera: Camera) -> bool:
 
 
 def read_light(root: Path) -> tuple[float | None, np.ndarray | None]:
-    """The true radiant intensity (light.txt) and offset (light_offset.txt, OpenCV camera axes), in the folder or in its test/ or train/;
-    None for what is not there. Raises UserError for files that hold no such numbers."""
+    """The true radiant intensity (light.txt) and offset (light_offset.txt; returned in OpenCV camera axes), of the folder or of its test/
+    or train/; None for what is not there. Raises UserError for files that hold no such numbers.
+
+    PIR writes the offset along Mitsuba's camera axes, left, up, forward. Relit's own captures have OpenCV's and say so in a first line
+    (AXES); those of before it are told by their truth/truth.json.
+    """
     out = []
     for name, count in (("light.txt", 1), ("light_offset.txt", 3)):
         file = next((p for p in (root / name, root / "test" / name, root / "train" / name) if p.is_file()), None)
         out.append(None if file is None else _numbers(file, count))
+        if name == "light_offset.txt" and file is not None:
+            ours = "opencv" in read_text(file).partition("\n")[0].lower() or (root / "truth" / "truth.json").is_file()
+            out[-1] = out[-1] if ours else cv_from_mitsuba_axes(out[-1])
     return None if out[0] is None else float(out[0][0]), out[1]
 
 
 def _numbers(file: Path, count: int) -> np.ndarray:
     try:
-        out = np.array([float(w) for w in read_text(file).replace(",", " ").split()])
+        lines = [line.partition("#")[0] for line in read_text(file).splitlines()]
+        out = np.array([float(w) for w in " ".join(lines).replace(",", " ").split()])
     except ValueError:
         out = np.empty(0)
     if out.shape != (count,) or not np.isfinite(out).all():

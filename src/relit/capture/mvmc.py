@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from relit import files
 from relit.capture.frames import Frame, Reading, image_folder, inside, read_json
 from relit.errors import UserError
 from relit.masks.rle import runs_from
@@ -26,7 +27,8 @@ def recognise(path: Path) -> Path | None:
     found = path if path.is_file() and path.name == ANNOTATIONS else path / ANNOTATIONS
     if not found.is_file():
         return None
-    entries = read_json(found).get("annotations")
+    data = files.read_json(found)  # any program's file may be called so
+    entries = data.get("annotations") if isinstance(data, dict) else None
     return found if isinstance(entries, list) and entries and isinstance(entries[0], dict) and "filename" in entries[0] else None
 
 

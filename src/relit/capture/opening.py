@@ -12,7 +12,7 @@ import numpy as np
 from relit.cameras.pinhole import lens_of
 from relit.capture import colmap_model, idr, iron, llff, middlebury, mvmc, photo, samurai, sfd, transforms_json
 from relit.capture.corrections import Corrected, corrected_masks, corrected_sphere, with_corrected_masks
-from relit.capture.frames import Frame, Reading
+from relit.capture.frames import Frame, Reading, check_max_side
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
 from relit.errors import UserError, did_you_mean
 from relit.images import Header, Image, read_small
@@ -46,6 +46,7 @@ def open_capture(
     max_side: int | None = None,
     min_photos: int = 3,
     focal: float | None = None,
+    labels: bool = True,
 ) -> Capture:
     """Read a capture of any known format; photos decode later, when `Photo.load` is called.
 
@@ -58,9 +59,10 @@ def open_capture(
     path = Path(path).expanduser()
     if masks not in MASKS and not masks.startswith("segment:"):
         raise UserError(f"unknown kind of masks '{masks}'.{did_you_mean(masks, MASKS)}", fix=f"choose one of {', '.join(MASKS)}", code=2)
+    check_max_side(max_side)
     if not path.exists():
         raise UserError("the input is not there", fix=f"check the path: {path}")
-    duplicates = sfd.recognise(path)
+    duplicates = sfd.recognise(path) if labels else None
     if duplicates is not None:
         return sfd.open_duplicates(duplicates, focal=focal, max_side=max_side)
     reading = _read(path)
@@ -75,6 +77,7 @@ def open_capture(
         )
     normals = photo.index_normals(reading.root)
     photos = [photo.photo_from(f, h, max_side, normals) for f, h in zip(reading.frames, headers, strict=True)]
+    photos = _with_facing_normals(photos, notes)
     if any(p.load.normal for p in photos):
         notes.append(f"{sum(p.load.normal is not None for p in photos)} photos have normal priors")
     photos, small, dark = _masked(reading, headers, photos, masks, notes)
@@ -123,7 +126,7 @@ def with_grabcut(capture: Capture) -> Capture:
     """The capture with masks that GrabCut guesses from the object sphere, for photos with cameras. Decodes every photo once."""
 
     def cut(p: Photo) -> Photo:
-        if isinstance(p.load, Corrected):
+        if _is_corrected(p):
             return p
         return photo.with_mask(p, grabcut(p.load().rgb, p.camera, capture.sphere))
 
@@ -132,6 +135,31 @@ def with_grabcut(capture: Capture) -> Capture:
     note = "masks were guessed by GrabCut from the object sphere; look at them"
     photos, held = (tuple(cut(p) for p in some) for some in (capture.photos, capture.held_out))
     return replace(capture, photos=photos, held_out=held, notes=(*capture.notes, note))
+
+
+def _is_corrected(p: Photo) -> bool:
+    """Whether the mask was corrected by hand, be the photo undistorted since or not."""
+    load = p.load
+    while load is not None and not isinstance(load, Corrected):
+        load = getattr(load, "load", None)
+    return load is not None
+
+
+def _with_facing_normals(photos: list[Photo], notes: list[str]) -> list[Photo]:
+    """The photos without their normal priors where these do not face the camera: world axes (Shiny Blender's _normal.png), or y up."""
+    looked = [p for p in photos if p.load.normal is not None][:5]
+    facing = []
+    for p in looked:
+        normal = photo.read_normal(p.load.normal, (p.height, p.width))
+        facing.append(normal[(normal != 0).any(-1)][:, 2] < 0.3)  # 0.3: a wide lens sees a little round the edge
+    facing = np.concatenate(facing) if facing else np.empty(0)
+    if len(facing) == 0 or facing.mean() > 0.9:
+        return photos
+    notes.append(
+        f"the normal priors are not used: {100 * (1 - facing.mean()):.0f} % of them look away from the camera; they must be in its axes, "
+        "x right, y down, z forward (docs/formats.md)"
+    )
+    return [_with(p, normal=None) for p in photos]
 
 
 def with_calibration(p: Photo, frame: Frame) -> Photo:
@@ -255,10 +283,11 @@ def _from_runs(reading: Reading, photos: list[Photo], notes: list[str]):
 
 def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
     folder, index = index_masks(reading.root)
-    files = [f.mask or find_mask(f.path, reading.root, index) for f in reading.frames]
+    named = any(f.mask is not None for f in reading.frames)
+    files = [f.mask if f.mask is not None and f.mask.is_file() else find_mask(f.path, reading.root, index) for f in reading.frames]
     missing = [f.name for f, m in zip(reading.frames, files, strict=True) if m is None or not m.is_file()]
     train = [f.name for f in reading.frames if not f.held_out]
-    if folder is None and not asked and len(missing) == len(files):
+    if folder is None and not asked and not named and len(missing) == len(files):
         return None
     if set(missing) & set(train):
         lacking = [n for n in missing if n in set(train)]
@@ -292,8 +321,8 @@ def _shrunk(mask: np.ndarray) -> np.ndarray:
 
 
 def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
-    step = max(1, len(photos) // LOOKED_AT)
-    looked = [_small(p).rgb for f, p in zip(reading.frames[::step], photos[::step], strict=True) if not f.held_out]
+    training = [p for f, p in zip(reading.frames, photos, strict=True) if not f.held_out]
+    looked = [_small(p).rgb for p in training[:: max(1, len(training) // LOOKED_AT)]]
     backdrop: Backdrop | None = find_backdrop(looked)
     if backdrop is None:
         if asked:

@@ -152,7 +152,10 @@ def photo_from(frame: Frame, header: Header, max_side: int | None, normals: dict
         size = (w, h)
     focal = None if header.focal is None else header.focal * size[0] / w
     normal = find_normal(frame.path, normals or {})
-    return Photo(frame.name, Decoder(frame.path, size, upright, normal=normal, orientation=header.orientation), *size, focal_hint=focal)
+    # of a photo that is left as stored, a mask of the other shape was made from the upright picture and is turned back
+    orientation = header.orientation if upright else {6: 8, 8: 6}.get(header.orientation, header.orientation)
+    decoder = Decoder(frame.path, size, upright, normal=normal, orientation=orientation)
+    return Photo(frame.name, decoder, *size, focal_hint=focal, flash_energy=frame.flash_energy)
 
 
 # ---------------------------------------------------------------- masks and normals from files

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from relit import files
 from relit.capture import mvmc
 from relit.capture.frames import Frame, Reading, image_folder, list_images, read_json
 from relit.errors import UserError, did_you_mean
@@ -51,7 +52,13 @@ def recognise(path: Path) -> Path | None:
         return path.parent if path.name == QUADRANTS else None
     if (path / QUADRANTS).is_file() or (path / HELD_OUT).is_file():
         return path
-    return path if (path / ANGLES).is_file() and "azimuths" in read_json(path / ANGLES) else None
+    return path if "azimuths" in (_of_any_kind(path / ANGLES) or ()) else None
+
+
+def _of_any_kind(file: Path) -> dict | None:
+    """A JSON object, or None: a metadata.json may be any program's."""
+    data = files.read_json(file)
+    return data if isinstance(data, dict) else None
 
 
 def read(path: Path, found: Path) -> Reading:
@@ -59,13 +66,13 @@ def read(path: Path, found: Path) -> Reading:
     folder = image_folder(found)
     if folder is None:
         raise UserError("a collection holds no photos", f"looked in image/ and images/ beside {QUADRANTS}", f"add them: {found}")
-    files = list_images(folder)
+    photos = list_images(folder)
     held = set(_names(read_json(found / HELD_OUT), found / HELD_OUT)) if (found / HELD_OUT).is_file() else set()
-    missing = held - {f.name for f in files}
+    missing = held - {f.name for f in photos}
     if missing:
         name = sorted(missing)[0]
         raise UserError(f"{HELD_OUT} names a photo that is not there: '{name}'", fix=f"mend the file: {found / HELD_OUT}")
-    frames = tuple(Frame(f, f.relative_to(found).as_posix(), held_out=f.name in held) for f in files)
+    frames = tuple(Frame(f, f.relative_to(found).as_posix(), held_out=f.name in held) for f in photos)
     return Reading("samurai", found, frames, kind="collection")
 
 
@@ -83,7 +90,7 @@ def read_hints(root: Path, names: list[str]) -> Hints | None:
     if (root / QUADRANTS).is_file():
         return _quadrants(root / QUADRANTS, names)
     if (root / ANGLES).is_file():
-        content = read_json(root / ANGLES)
+        content = _of_any_kind(root / ANGLES) or {}
         if "azimuths" in content:
             return _angles(content, root / ANGLES, names)
     cars = mvmc.recognise(root)

@@ -20,7 +20,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from relit.capture.frames import image_folder, list_images, pose_from, read_json
+from relit.capture.corrections import corrected_labels
+from relit.capture.frames import check_max_side, image_folder, list_images, pose_from, read_json
 from relit.capture.labels import BOP_TRUTH, bop_object, checked_labels, read_labels
 from relit.capture.networks import Network, found_instances
 from relit.capture.photo import Decoder
@@ -133,7 +134,7 @@ def open_duplicates(source: Source, *, focal: float | None = None, max_side: int
     photos = []
     for path, labels in ((source.photo, source.labels), *source.more):
         header = read_header(path)
-        own, dropped = checked_labels(read_labels(labels, path, (header.height, header.width)), labels)
+        own, dropped = usable_labels(read_labels(labels, path, (header.height, header.width)), labels, source.root, path)
         named = f"{path.name}: " if source.more else ""
         notes += [named + note for note in (*dropped, f"{len(np.unique(own[own > 0]))} objects in {labels.name}")]
         photos.append(labelled_photo(source, path, header, own, focal, max_side, notes))
@@ -146,6 +147,7 @@ def open_duplicates(source: Source, *, focal: float | None = None, max_side: int
 
 def open_segmented(path: Path, network: str, *, focal: float | None = None, max_side: int | None = None) -> Capture:
     """As `open_duplicates` for a photo, or a folder of photos of one pile, whose labels an ONNX network finds (`capture.networks`)."""
+    check_max_side(max_side)
     files = [path]
     if path.is_dir():
         files = [f for f in list_images(image_folder(path) or path) if _is_photo(f)][:MOST_PHOTOS]
@@ -155,10 +157,19 @@ def open_segmented(path: Path, network: str, *, focal: float | None = None, max_
     source, notes, photos = Source(root, files[0], Path(network), _cameras(root)), [], []
     segmenter = Network(network)
     for file in files:
-        labels, dropped = checked_labels(found_instances(segmenter, read_image(file).rgb), file)
+        labels, dropped = usable_labels(found_instances(segmenter, read_image(file).rgb), file, root, file)
         notes += [*dropped, f"{file.name}: {len(np.unique(labels[labels > 0]))} objects found by {Path(network).name}; look at them"]
         photos.append(labelled_photo(source, file, read_header(file), labels, focal, max_side, notes))
     return Capture(root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates")
+
+
+def usable_labels(labels: np.ndarray, source: Path, root: Path, photo: Path) -> tuple[np.ndarray, list[str]]:
+    """Labels as `checked_labels` leaves them, corrected by hand where they were (`capture.corrections`), and notes about both."""
+    own, dropped = checked_labels(labels, source)
+    fixed, notes = corrected_labels(own, root, photo.relative_to(root).as_posix())
+    if notes:
+        own, dropped = checked_labels(np.where(own < 0, labels, fixed), source)
+    return own, [*dropped, *notes]
 
 
 def labelled_photo(

@@ -5,7 +5,7 @@ The folder has the layout of IRON and PIR, with what Relit measures besides unde
     train/cam_dict_norm.json  train/image/r_000.exr  train/mask/r_000.png
     test/cam_dict_norm.json   test/image/t_000.exr   test/mask/t_000.png
     test/{diffuse_albedo,specular_albedo,specular_roughness}/t_000.exr     linear; roughness is the lobe's width alpha
-    light.txt  light_offset.txt             radiant intensity; offset in OpenCV camera axes, world units
+    light.txt  light_offset.txt             radiant intensity; offset in OpenCV camera axes (its first line says so), world units
     truth/truth.json  truth/mesh.ply  truth/normal/t_000.exr               coverage is the normals' alpha
 
 The object: shape and colours of a GLB or OBJ. Colours are the diffuse albedo; specular albedo and roughness vary over the surface with
@@ -23,6 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from relit.capture.iron import AXES
 from relit.capture.synthetic import _claim, _identity, _report, _write_json, _write_mesh, object_frame, orbit_cameras
 from relit.conventions import srgb_from_linear
 from relit.errors import UserError
@@ -89,7 +90,7 @@ def synthesize_flash(
     _write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
     flash = Flash(np.array(offset, np.float64), np.full(3, exposure(scene, train, np.array(offset, np.float64), max_depth)))
     write_text(out / "light.txt", f"{flash.intensity[0]:.8g}\n")
-    write_text(out / "light_offset.txt", " ".join(f"{v:.8g}" for v in flash.offset) + "\n")
+    write_text(out / "light_offset.txt", f"{AXES}\n" + " ".join(f"{v:.8g}" for v in flash.offset) + "\n")
     _write_cameras(out / "train" / "cam_dict_norm.json", train)
     _write_cameras(out / "test" / "cam_dict_norm.json", test)
     for i, (name, camera) in enumerate(train):

@@ -15,13 +15,16 @@ from relit.images import EXTENSIONS, read_header
 from relit.scene import Camera
 
 LOOKED_FOR = "transforms.json or transforms_train.json"
+OTHERS = ("cam_dict_norm.json", "quadrants.json", "annotations.json")  # of other readers
+# last what Synthetic4Relight leaves out: train/000_rgb.exr, test/000_rgba.png
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".hdr", ".webp", "_rgb.exr", "_rgb.png", "_rgba.png")
 PINHOLE, OPENCV, FISHEYE = {"PINHOLE", "SIMPLE_PINHOLE"}, {"OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV"}, {"OPENCV_FISHEYE"}
 
 
 def recognise(path: Path) -> Path | None:
     """The JSON file of the training photos, or None."""
     if path.is_file():
-        return path if path.suffix.lower() == ".json" else None
+        return path if path.suffix.lower() == ".json" and path.name not in OTHERS else None
     return next((path / n for n in ("transforms_train.json", "transforms.json") if (path / n).is_file()), None)
 
 
@@ -70,7 +73,9 @@ def _frames(data: dict, root: Path, source: Path) -> tuple[list[Frame], list[str
             "a transforms file has no frames", "the key 'frames' must be a list of photos with their poses", f"write it again: {source}"
         )
     found, missing = [], []
-    asides = [d for d in sorted(root.iterdir()) if d.is_dir() and d.name.lower().startswith(("heldout", "held_out", "test"))]
+    # test/ of a split with a file of its own holds other photos, of the same names
+    prefixes = ("heldout", "held_out") if (root / "transforms_test.json").is_file() else ("heldout", "held_out", "test")
+    asides = [d for d in sorted(root.iterdir()) if d.is_dir() and d.name.lower().startswith(prefixes)]
     for i, entry in enumerate(entries):
         what = f"frame {i}"
         if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str) or not entry["file_path"]:
@@ -95,7 +100,7 @@ def _image_file(wanted: Path, asides: list[Path]) -> tuple[Path | None, bool]:
         try:
             if exact.is_file() and exact.suffix.lower() in EXTENSIONS:
                 return exact, aside
-            for suffix in (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".hdr", ".webp"):
+            for suffix in SUFFIXES:
                 if (folder / (wanted.name + suffix)).is_file():
                     return folder / (wanted.name + suffix), aside
         except OSError:  # a name that the file system cannot hold

@@ -1,7 +1,8 @@
 """What is measured on the asset of a collection: recovered cameras after Procrustes, held-out photos from their own fitted camera and
 light, material and shape in the true test views.
 
-The truth is the folder that `relit synthesize collection` wrote. Pictures are rendered by the package's path tracer.
+The truth is the folder that `relit synthesize collection` wrote (of real photos see `evaluate.collection_photos`). Pictures are rendered
+by the package's path tracer.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from relit.cameras.se3 import align_cameras as align_poses
-from relit.cameras.se3 import camera_errors, nearest_rotation, umeyama
+from relit.cameras.se3 import camera_errors, nearest_rotation, rotation_angle, umeyama
 from relit.conventions import move_points, move_pose, similarity
 from relit.errors import UserError
 from relit.evaluate import metrics as m
@@ -64,8 +65,9 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
     """As `evaluate_collection`, for an asset in memory."""
     from relit.rendering.mitsuba_scene import build_scene
 
+    check_lights(asset)
     found = {camera_key(name): (camera, light) for (name, camera), light in zip(asset.cameras, asset.lights, strict=True)}
-    values, world_from_found, per_view = pose_figures({n: c for n, (c, _) in found.items()}, truth)
+    values, world_from_found, per_view = pose_figures({n: c for n, (c, _) in found.items()}, truth.train, truth.test)
     for i, name in enumerate(n for n in truth.test if n in found):
         per_view.setdefault(name, {}).update(picture_figures(asset, *found[name], truth.picture(f"test/{name}"), spp, seed + i))
     placed = replace(asset, world_from_asset=onto_surface(asset, world_from_found, truth))
@@ -76,28 +78,38 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
     for key in sorted({k for figures in per_view.values() for k in figures}):
         values[key] = float(np.mean([figures[key] for figures in per_view.values() if key in figures]))
     values.update(chamfer_figures(placed.mesh, placed.world_from_asset, truth))
-    metrics: dict[str, Any] = {}
-    for name, value in values.items():
-        if name in DEFINITIONS:
-            unit, definition = DEFINITIONS[name]
-            metrics[name] = {"value": float(value), "unit": unit, "definition": definition}
-        else:
-            metrics.update(entry(name, value))
+    metrics = {k: v for name, value in values.items() for k, v in (named if name in DEFINITIONS else entry)(name, value).items()}
     return {"metrics": metrics, "per_view": per_view, "albedo_scale": [float(x) for x in scale], "alignment": "sim3"}
 
 
-def pose_figures(found: dict[str, Camera], truth: Truth) -> tuple[dict[str, float], np.ndarray, dict[str, dict[str, float]]]:
-    """(figures, world_from_found (4, 4), per held-out view figures)."""
-    names = [n for n in truth.train if n in found]
+def check_lights(asset: Asset) -> None:
+    """Raises UserError for an asset that is of no collection."""
+    if not asset.lights:
+        why = "the photos were taken under different lights; only a collection's asset holds the light of each"
+        raise UserError("the asset has no light for each photo", why, "reconstruct with --capture collection")
+
+
+def named(name: str, value: float, note: str = "") -> dict[str, dict[str, Any]]:
+    """{name: {"value", "unit", "definition"}} of a figure of this module. note: what the definition says besides."""
+    unit, definition = DEFINITIONS[name]
+    return {name: {"value": float(value), "unit": unit, "definition": definition + note}}
+
+
+def pose_figures(
+    found: dict[str, Camera], train: dict[str, Camera], test: dict[str, Camera], centre=(0.0, 0.0, 0.0)
+) -> tuple[dict[str, float], np.ndarray, dict[str, dict[str, float]]]:
+    """(figures, world_from_found (4, 4), per held-out view figures). train, test: true cameras. centre: (3,) of the object in their frame.
+    Focal lengths are compared in widths of the picture."""
+    names = [n for n in train if n in found]
     if len(names) < 3:
         raise UserError("fewer than 3 recovered cameras have the name of a true one", "the asset was made from other photos")
     a = np.array([found[n].world_from_camera for n in names])
-    b = np.array([truth.train[n].world_from_camera for n in names])
+    b = np.array([train[n].world_from_camera for n in names])
     angle, distance = camera_errors(a, b)
     good = angle <= max(3 * float(np.median(angle)), 1.0)
     world_from_found = align_poses(a[good], b[good])
-    away = float(np.mean(np.linalg.norm(b[:, :3, 3], axis=1)))
-    focal = [abs(found[n].fx / truth.train[n].fx - 1) for n in names]
+    away = float(np.mean(np.linalg.norm(b[:, :3, 3] - np.asarray(centre), axis=1)))
+    focal = [abs(found[n].fx / found[n].width * train[n].width / train[n].fx - 1) for n in names]
     values = {
         "rotation_mean": float(angle.mean()),
         "rotation_median": float(np.median(angle)),
@@ -106,10 +118,9 @@ def pose_figures(found: dict[str, Camera], truth: Truth) -> tuple[dict[str, floa
         "focal_percent": float(100 * np.mean(focal)),
     }
     per_view = {}
-    for n in (n for n in truth.test if n in found):
+    for n in (n for n in test if n in found):
         moved = move_pose(world_from_found, found[n].world_from_camera)
-        cosine = (np.trace(moved[:3, :3].T @ truth.test[n].world_from_camera[:3, :3]) - 1) / 2
-        per_view[n] = {"held_out_rotation": float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))}
+        per_view[n] = {"held_out_rotation": rotation_angle(moved[:3, :3].T @ test[n].world_from_camera[:3, :3])}
     return values, world_from_found, per_view
 
 

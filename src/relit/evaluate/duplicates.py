@@ -68,15 +68,6 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
 }
 
 
-def is_duplicates_truth(folder: str | Path) -> bool:
-    """Whether `relit synthesize duplicates` made the folder."""
-    file = Path(folder) / "truth" / "settings.json"
-    try:
-        return json.loads(file.read_text()).get("kind") == "duplicates"
-    except (OSError, ValueError, AttributeError):
-        return False
-
-
 def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
     """Every figure that the truth allows, as `evaluate.protocols.evaluate`. Raises UserError where the truth is unfinished."""
     from relit.asset.asset import load_asset
@@ -208,8 +199,7 @@ def photo_figure(asset: Asset, capture: Path, *, spp: int = 64, seed: int = 0) -
     """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr)."""
     from relit.capture.sfd import open_duplicates, recognise
     from relit.evaluate.photos import shrunk
-    from relit.rendering.mitsuba_scene import build_scene, render
-    from relit.rendering.pile import build_pile
+    from relit.rendering.photographed import as_photographed
 
     source = recognise(capture)
     if source is None or not asset.cameras:
@@ -220,8 +210,7 @@ def photo_figure(asset: Asset, capture: Path, *, spp: int = 64, seed: int = 0) -
     factor = min(1.0, PHOTO_SIDE / max(camera.width, camera.height))
     camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
     rgb, where = shrunk(pixels.rgb, camera), shrunk(own.astype(np.float32), camera) >= m.MASK
-    pile = build_pile(asset.mesh, asset.material, [i.world_from_object for i in asset.instances if i.registered], asset.ground)
-    picture = render(build_scene(pile.mesh, pile.material, np.eye(4), asset.environment), camera, spp=spp, seed=seed)
+    picture = as_photographed(asset)(asset.cameras[0][0], camera, spp=spp, seed=seed)
     return m.psnr(m.encode(picture[..., :3]), m.encode(rgb), where)
 
 

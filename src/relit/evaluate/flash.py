@@ -144,8 +144,9 @@ def evaluate_flash_asset(asset: Asset, truth: FlashTruth, *, spp: int = 256, see
 def view_figures(scene, asset: Asset, truth: FlashTruth, name: str, camera: Camera, ratio: float, spp: int, seed: int) -> dict[str, float]:
     """All figures of one test view."""
     from relit.rendering.flash_scene import render_flash, render_maps
+    from relit.rendering.photographed import FLASH_DEPTH
 
-    picture = render_flash(scene, camera, asset.flash, spp, seed=seed, max_depth=5)[..., :3]
+    picture = render_flash(scene, camera, asset.flash, spp, seed=seed, max_depth=FLASH_DEPTH)[..., :3]
     maps = render_maps(scene, camera, spp=256)  # primary rays alone; fewer leave noise at outlines that costs half a dB
     a, b = m.encode(picture), m.encode(truth.picture("image", name)[..., :3])
     seen = maps["coverage"][..., None]

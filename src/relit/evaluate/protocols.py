@@ -38,6 +38,17 @@ class Truth:
         return read_data(self.folder / "truth" / f"{relative}.exr")
 
 
+def truth_kind(folder: str | Path) -> str:
+    """The kind of capture that `relit synthesize` made of the folder, as its truth/settings.json says ('duplicates', 'collection'); ''
+    where that names none."""
+    try:
+        said = json.loads((Path(folder) / "truth" / "settings.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    kind = said.get("kind") if isinstance(said, dict) else None
+    return kind if isinstance(kind, str) else ""
+
+
 def has_truth(folder: str | Path) -> bool:
     """Whether `relit synthesize` made the folder, finished or not."""
     folder = Path(folder)
@@ -80,29 +91,40 @@ def camera_key(name: str) -> str:
 
 def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
     """Every figure that the truth allows, for the asset in a run or asset folder. truth_folder: what `relit synthesize` wrote; or the
-    capture that the asset was made from, whose photos are the truth then (evaluate/photos.py).
+    capture that the asset was made from, whose photos are the truth then (evaluate/photos.py, evaluate/collection_photos.py).
 
     spp: samples a pixel of the pictures that are compared; their noise counts as error. Returns {"metrics": {name: {"value", "unit",
     "definition"}}, "per_view": {view: {name: value}}, "albedo_scale": [r, g, b], "alignment": "identity" or "sim3"}.
     Call `relit.device.use_device` first.
     """
     from relit.asset.asset import load_asset
-    from relit.evaluate.duplicates import evaluate_duplicates, evaluate_on_photo, is_duplicates_truth
+    from relit.evaluate.duplicates import evaluate_duplicates, evaluate_on_photo
     from relit.evaluate.flash import evaluate_flash, is_flash_truth
 
-    if is_duplicates_truth(truth_folder):
-        return evaluate_duplicates(run_or_asset, truth_folder, spp=min(spp, 64), seed=seed)
-    if is_flash_truth(truth_folder):
-        return evaluate_flash(run_or_asset, truth_folder, spp=spp, seed=seed)
+    folder = Path(truth_folder)
+    folder = folder.parent if folder.name == "truth" and (folder / "settings.json").is_file() else folder
+    kind = truth_kind(folder)
+    if kind == "duplicates":
+        return evaluate_duplicates(run_or_asset, folder, spp=min(spp, 64), seed=seed)
+    if is_flash_truth(folder):
+        return evaluate_flash(run_or_asset, folder, spp=spp, seed=seed)
     asset = load_asset(run_or_asset)
-    if has_truth(truth_folder):
-        result = evaluate_asset(asset, load_truth(truth_folder), spp=spp, seed=seed)
+    if kind == "collection":
+        from relit.evaluate.collection import evaluate_collection
+
+        result = evaluate_collection(run_or_asset, folder, spp=spp, seed=seed)
+    elif has_truth(folder):
+        result = evaluate_asset(asset, load_truth(folder), spp=spp, seed=seed)
     elif asset.instances:
-        result = evaluate_on_photo(run_or_asset, truth_folder, spp=min(spp, 64), seed=seed)
+        result = evaluate_on_photo(run_or_asset, folder, spp=min(spp, 64), seed=seed)
+    elif asset.lights:
+        from relit.evaluate.collection_photos import evaluate_on_collection
+
+        result = evaluate_on_collection(asset, folder, run=Path(run_or_asset), spp=spp, seed=seed)
     else:
         from relit.evaluate.photos import evaluate_on_photos
 
-        result = evaluate_on_photos(asset, Path(truth_folder), run=Path(run_or_asset), spp=spp, seed=seed)
+        result = evaluate_on_photos(asset, folder, run=Path(run_or_asset), spp=spp, seed=seed)
     value = glb_roundtrip(asset, Path(run_or_asset) / "stages" / "asset")
     if value is not None:
         result["metrics"].update(entry("glb_roundtrip_psnr", value))

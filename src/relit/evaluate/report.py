@@ -14,15 +14,17 @@ import numpy as np
 from relit.asset.asset import load_asset
 from relit.capture.procedural import evening, studio
 from relit.conventions import linear_from_srgb, rotate_environment
+from relit.evaluate.comparison import SHOWN, TITLES, fitted, kind_of, pairs, spread
 from relit.evaluate.curves import ball_of, bars, camera_plot, curve
-from relit.evaluate.metrics import encode, psnr
 from relit.files import parse_toml, read_json, write_text
 from relit.images import encode_jpeg
 from relit.log import readable_bytes, readable_seconds
 from relit.relight import orbit
+from relit.rendering.flash_scene import build_flash_scene, render_maps
 from relit.rendering.mitsuba_scene import build_scene, render, render_channels
+from relit.rendering.photographed import lit_scene
 from relit.run import read_metrics, read_stages
-from relit.scene import Asset, Camera, Capture
+from relit.scene import Asset, Capture
 
 SIDE = 240  # pixels, longer side of a picture
 VIEWS = 4  # training photos that are compared
@@ -48,12 +50,10 @@ def write_report(run: str | Path, capture: Capture | None = None) -> Path:
     """Write RUN/report.html. capture: the photos to compare with (without it that part is left out). Call `use_device` first."""
     run = Path(run)
     asset = load_asset(run)
-    # as the asset stands in its GLB: what is shown is what is shipped
-    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
-    parts = [
+    parts = [  # as the asset stands in its folder: what is shown is what is shipped
         _head(run, asset),
-        _section("Photos and renders under the recovered light", _comparison(asset, scene, capture)),
-        _section("Material and shape", _channels(asset, scene)),
+        _section(TITLES[kind_of(asset)], _comparison(asset, capture)),
+        _section("Material and shape", _channels(asset)),
         _section("Light", _light(asset)),
         _section("Another light", _turntables(asset)),
         _section("Figures against the truth", _figures(run)),
@@ -78,6 +78,7 @@ def _head(run: Path, asset: Asset) -> str:
     seconds = sum(s["seconds"] for s in read_stages(run))
     facts = [
         f"{len(asset.cameras)} cameras",
+        *([f"{sum(i.registered for i in asset.instances)} of {len(asset.instances)} objects registered"] if asset.instances else []),
         ", ".join(f"{key} {value}" for key, value in {**meta, **config}.items() if key in ("quality", "seed", "device")),
         f"{len(asset.mesh.faces):,} triangles",
         "textures {1}x{0}".format(*asset.material.base_color.shape[:2]),
@@ -86,59 +87,60 @@ def _head(run: Path, asset: Asset) -> str:
     return f"<h1>{escape(_title(run))}</h1><p>{' &middot; '.join(escape(f) for f in facts)}</p>"
 
 
-def _comparison(asset: Asset, scene, capture: Capture | None) -> str:
-    photos = {} if capture is None else {p.name: p for p in (*capture.photos, *capture.held_out)}
+def _comparison(asset: Asset, capture: Capture | None) -> str:
+    if capture is None:
+        return ""
+    shown = pairs(asset, capture, views=VIEWS, held_out=HELD_OUT, side=SIDE, spp=SPP_COMPARED)
+    rows = [_figure(np.concatenate([p.photo, p.render[..., :3], p.difference], axis=1), p.caption) for p in shown]
+    what = f"Photo; render: {SHOWN[kind_of(asset)]}; difference x 4."
+    how = f"{SPP_COMPARED} samples a pixel. PSNR of sRGB pictures at this size, noise included."
+    return f"<div class=row>{''.join(rows)}</div><p>{what} {how}</p>" if rows else ""
+
+
+def _channels(asset: Asset) -> str:
     rows = []
-    held_out = [] if capture is None else [(p.name, p.camera) for p in capture.held_out if p.camera is not None]
-    chosen = _spread([c for c in asset.cameras if c[0] in photos], VIEWS) + _spread(held_out, HELD_OUT)
-    for name, camera in chosen:
-        pixels = photos[name].load()
-        small = _fitted(camera)
-        photo = _resized(pixels.rgb, small)
-        picture = render(scene, small, spp=SPP_COMPARED)
-        seen = picture[..., 3] > 0.5
-        if pixels.mask is not None:
-            photo = photo * _resized(pixels.mask[..., None], small)
-        quality = psnr(encode(picture[..., :3]), encode(photo), seen)
-        name += " (held out)" if any(name == n for n, _ in held_out) else ""
-        caption = f"{name}: {quality:.1f} dB where the object is drawn" if seen.any() else f"{name}: the object is not in view"
-        pair = np.concatenate([photo, picture[..., :3], _difference(photo, picture)], axis=1)
-        rows.append(_figure(pair, caption))
-    how = f"Photo, render with {SPP_COMPARED} samples a pixel, difference x 4. PSNR of sRGB pictures at this size, noise included."
-    return f"<div class=row>{''.join(rows)}</div><p>{how}</p>" if rows else ""
-
-
-def _difference(photo: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    seen = picture[..., 3:] > 0.5
-    return linear_from_srgb(np.clip(4 * np.abs(encode(photo) - encode(picture[..., :3])), 0, 1)) * seen
-
-
-def _channels(asset: Asset, scene) -> str:
-    rows = []
-    for name, camera in _spread(asset.cameras, 3)[:2]:  # the first and the middle one: the last often stands beside the first
-        small = _fitted(camera)
-        c = render_channels(scene, small, spp=16)
-        a = c["alpha"][..., None]
-        shown = {
-            "base colour": c["albedo"],
-            "roughness": linear_from_srgb(np.repeat(c["roughness"][..., None], 3, 2)),
-            "metallic": linear_from_srgb(np.repeat(c["metallic"][..., None], 3, 2)),
-            "normal (world)": linear_from_srgb(np.clip(0.5 * c["normal"] + 0.5, 0, 1)),
-        }
-        cells = "".join(_figure(v * a + BACKDROP * (1 - a), k if k != "base colour" else f"{k}, {name}") for k, v in shown.items())
+    flash = asset.flash is not None
+    scene = build_flash_scene(asset.mesh, asset.material, asset.world_from_asset) if flash else lit_scene(asset, ground=False)
+    for name, camera in spread(asset.cameras, 3)[:2]:  # the first and the middle one: the last often stands beside the first
+        small = fitted(camera, SIDE)
+        c = render_maps(scene, small) if flash else render_channels(scene, small, spp=16)
+        a = c["coverage" if flash else "alpha"][..., None]
+        if flash:
+            shown = {"diffuse albedo": c["diffuse"], "specular albedo": _grey(c["specular"]), "roughness": _grey(np.sqrt(c["alpha"]))}
+        else:
+            shown = {"base colour": c["albedo"], "roughness": _grey(c["roughness"]), "metallic": _grey(c["metallic"])}
+        shown["normal (world)"] = linear_from_srgb(np.clip(0.5 * c["normal"] + 0.5, 0, 1))
+        colour = next(iter(shown))
+        cells = "".join(_figure(v * a + BACKDROP * (1 - a), k if k != colour else f"{k}, {name}") for k, v in shown.items())
         rows.append(f"<div class=row>{cells}</div>")
     return "".join(rows)
 
 
+def _grey(plane: np.ndarray) -> np.ndarray:
+    """(H, W) numbers from 0 to 1 -> (H, W, 3) linear greys that look even."""
+    return linear_from_srgb(np.repeat(np.clip(plane, 0, 1)[..., None], 3, 2))
+
+
 def _light(asset: Asset) -> str:
+    if asset.flash is not None:
+        offset, intensity = (", ".join(f"{v:.4g}" for v in values) for values in (asset.flash.offset, asset.flash.intensity))
+        where = "x right, y down, z forward of the camera, in the units of cameras.json"
+        return f"<p>A point light that moves with the camera: offset ({offset}), {where}; radiant intensity ({intensity}).</p>"
     if asset.environment is None:
         return "<p>The asset holds no environment map.</p>"
     e = asset.environment
     level = float(np.mean(e)) or 1.0
-    shown = [(0.3 / level, "mean radiance drawn as .3"), (0.02 / level, "15 times darker: what is bright")]
+    whole = "the middle one of all photos' lights, " if asset.lights else ""
+    shown = [(0.3 / level, f"{whole}mean radiance drawn as .3"), (0.02 / level, "15 times darker: what is bright")]
     cells = "".join(_figure(_scaled(e * k, 480), text) for k, text in shown)
     peak = f"Mean {level:.3g}, largest {float(e.max()):.3g}, in units of the photos' linear pixels. Middle of the picture: +Z, top: +Y."
-    return f"<div class=row>{cells}</div><p>{peak}</p>"
+    own = spread([(name, light) for (name, _), light in zip(asset.cameras, asset.lights, strict=False)], VIEWS)
+    means = [float(np.mean(light)) or 1.0 for _, light in own]
+    each = "".join(
+        _figure(_scaled(light * (0.3 / mean), SIDE), f"light of {name}, mean {mean:.3g} drawn as .3")
+        for (name, light), mean in zip(own, means, strict=True)
+    )
+    return f"<div class=row>{cells}</div>" + (f"<div class=row>{each}</div>" if each else "") + f"<p>{peak}</p>"
 
 
 def _turntables(asset: Asset) -> str:
@@ -156,13 +158,14 @@ def _turntables(asset: Asset) -> str:
         frame = f'<div class=turn style="width:{SIDE}px;height:{SIDE}px">{picture}</div>'
         cells.append(f"<figure>{frame}<figcaption>{escape(name)}</figcaption></figure>")
         cells.append(_figure(_scaled(np.concatenate([strip[:, i * SIDE : (i + 1) * SIDE] for i in (0, 4, 8)], 1), 3 * 200), "stills of it"))
-    return f"<div class=row>{''.join(cells)}</div>"
+    plastic = "<p>With the metallic-roughness material of object.glb, which stands for the rough plastic.</p>" if asset.flash else ""
+    return f"<div class=row>{''.join(cells)}</div>{plastic}"
 
 
 def _figures(run: Path) -> str:
     found = read_json(run / "evaluation.json")
     if not found:
-        return "<p>No truth was given. <code>relit evaluate RUN --truth DIR</code> measures against a synthetic capture.</p>"
+        return "<p>No truth was given. <code>relit evaluate RUN --truth DIR</code> measures against a synthetic capture or the photos.</p>"
     rows = [(name, f"{e['value']:.4g}", e["unit"], e["definition"]) for name, e in found["metrics"].items()]
     return _table(("figure", "value", "unit", "definition"), rows)
 
@@ -186,11 +189,9 @@ def _costs(run: Path) -> str:
 
 def _textures(asset: Asset) -> str:
     m = asset.material
-    shown = {
-        "base colour": m.base_color,
-        "roughness": linear_from_srgb(np.repeat(np.clip(m.roughness, 0, 1)[..., None], 3, 2)),
-        "metallic": linear_from_srgb(np.repeat(np.clip(m.metallic, 0, 1)[..., None], 3, 2)),
-    }
+    shown = {"base colour": m.base_color, "roughness": _grey(m.roughness), "metallic": _grey(m.metallic)}
+    if m.specular is not None:
+        shown["specular"] = _grey(m.specular if np.ndim(m.specular) == 2 else np.mean(m.specular, -1))
     if m.normal is not None:
         shown["normal (tangent)"] = linear_from_srgb(np.clip(0.5 * np.asarray(m.normal) + 0.5, 0, 1))
     return f"<div class=row>{''.join(_figure(_scaled(v, SIDE), k) for k, v in shown.items())}</div>"
@@ -218,25 +219,6 @@ def _files(run: Path) -> str:
 
 
 # ---------------------------------------------------------------- pieces
-
-
-def _spread(items, count: int) -> list:
-    """At most `count` items, evenly spread."""
-    items = list(items)
-    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))] if items else []
-
-
-def _fitted(camera: Camera) -> Camera:
-    k = SIDE / max(camera.width, camera.height)
-    return camera if k >= 1 else camera.resized(max(1, round(camera.width * k)), max(1, round(camera.height * k)))
-
-
-def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W, C) linear picture at the size of `camera`, by the mean over areas."""
-    import cv2
-
-    out = cv2.resize(np.ascontiguousarray(image, dtype=np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return out[..., None] if out.ndim == 2 else out
 
 
 def _scaled(image: np.ndarray, width: int) -> np.ndarray:

@@ -27,7 +27,7 @@ from relit.fit.collection_growth import find_poses
 from relit.fit.collection_held_out import held_out_stage, look_again
 from relit.fit.collection_links import links_stage, poses_from_links, with_focals
 from relit.fit.collection_options import CollectionOptions, options_for
-from relit.fit.collection_photos import Shot, crops_of, load_shots
+from relit.fit.collection_photos import LEAST_PHOTOS, Shot, crops_of, load_shots
 from relit.fit.collection_poses import GREY, agreement, schedule_of
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, posterior, start_collection_surface
 from relit.fit.multiview import run_arrays, vertex_areas
@@ -46,7 +46,7 @@ from relit.rendering.shade_photos import shade_photos, start_photo_lights
 from relit.rendering.transport import TraceableMesh
 from relit.scene import Asset, Camera, Capture, Material, Mesh
 
-__all__ = ["CollectionOptions", "options_for", "reconstruct"]
+__all__ = ["LEAST_PHOTOS", "CollectionOptions", "options_for", "reconstruct"]
 LIGHT = "one light per photo (collection)"
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("links", "poses", "volume", "second_look", "mesh", "surface", "held_out")

@@ -157,7 +157,7 @@ def fit_collection_surface(
         a, b = reflected(points, drawn, surface, of)
         heard = np.maximum(model.weights, LEAST).astype(np.float32)
         weight = dr.gather(mi.Float, mi.Float(heard), batch.view)
-        each = residuals(a, b, batch.rgb)
+        each = residuals(a, b, batch.rgb, bank.saturated)
         fit = weighted_mean(each, dr.select(valid, weight, 0))
         loss = fit
         if not frozen:
@@ -236,11 +236,11 @@ def exchange_scale(adam: Adam, material: MaterialField, colour_gradient, gain_gr
     return move.astype(np.float32)
 
 
-def residuals(a, b, target):
-    """Per point: mean over channels of display_weight (a - L*)(b - L*), unbiased for the squared error. A pixel whose file value is
-    saturated only says "at least this bright"."""
+def residuals(a, b, target, saturated: float):
+    """Per point: mean over channels of display_weight (a - L*)(b - L*), unbiased for the squared error. A pixel from
+    `saturated` on only says "at least this bright"."""
     value = (a - target) * (b - target) * display_weight(target)
-    value = dr.select((target >= 0.99) & (dr.detach((a + b) * 0.5) > target), 0, value)
+    value = dr.select((target >= saturated) & (dr.detach((a + b) * 0.5) > target), 0, value)
     return (value.x + value.y + value.z) / 3
 
 

@@ -3,7 +3,7 @@
     poses     a virtual camera for each instance; matching, and search by rendering      fit/duplicates_poses.py, fit/instance_search.py
     photos    of several photos of one pile how they stand to each other                 fit/pile_photos.py
     volume     one signed distance field in the object's frame, seen by all virtual cameras; poses move with it      fit/volume.py
-    mesh       zero level set, decimated; texture atlas; the ground that the instances stand on
+    mesh       zero level set, decimated; mesh and poses as the outlines are; texture atlas; the ground      fit/outlines.py
     surface    one material for all instances and one environment, light traced past all instances and the ground     fit/surface.py
     asset      object, instances, ground and light in the frame of the user's camera
 
@@ -29,6 +29,7 @@ from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.instance_search import Search
 from relit.fit.instances import ANOTHER_PHOTO, View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.multiview import run_arrays, vertex_areas
+from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
 from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
@@ -123,7 +124,11 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     poses = moved_poses(bank, views, poses)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
-        mesh, how = unwrap(extract_mesh(values, faces=options.faces), options.texture)
+        mesh = extract_mesh(values, faces=options.faces)
+        if rate > 0:
+            cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+            mesh, poses = follow_with_poses(mesh, cameras, [v.mask for v in views], [v.known for v in views], options.outlines)
+        mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
         rows = row_features(model.grid)

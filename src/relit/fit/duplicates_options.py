@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from relit.cameras.matcher import STEP
 from relit.errors import UserError, did_you_mean
 from relit.lighting.spherical_gaussians import MAX_LOBES
 
@@ -12,10 +13,11 @@ from relit.lighting.spherical_gaussians import MAX_LOBES
 class DuplicatesOptions:
     """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for all poses. levels, level_steps, rays:
     of the volume pass. refine_poses: step of the pose corrections in it (radians, unit lengths). faces, texture: of the object.
-    surface_steps, points, directions, light: of the surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for
-    a map. first_material: look for metal and dull paint before the surface pass (`fit.first_material`). max_pixels: of
-    the photos. matcher: 'module:function', see `cameras.matcher`. normal_network: an ONNX file, see `capture.networks`. without: parts
-    that are switched off, names of WITHOUT.
+    outlines: rounds in which the poses and the mesh follow the labels (fit/outlines.py). surface_steps, points, directions, light: of the
+    surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for a map. first_material: look for metal and dull
+    paint before the surface pass (`fit.first_material`). max_pixels: of the photos. matcher: 'module:function', see `cameras.matcher`.
+    matcher_step: degrees by which it sees one picture of a pair turned, a divisor of 360 (SfD: 4, as for the built-in SIFT, which this
+    does not concern). normal_network: an ONNX file, see `capture.networks`. without: parts that are switched off, names of WITHOUT.
     """
 
     side: int = 320
@@ -25,6 +27,7 @@ class DuplicatesOptions:
     rays: int = 6144
     refine_poses: float = 0.004
     faces: int = 16_000
+    outlines: int = 5
     texture: int = 512
     surface_steps: int = 900
     points: int = 4096
@@ -34,12 +37,15 @@ class DuplicatesOptions:
     first_material: bool = False
     max_pixels: int = 4_000_000
     matcher: str = ""
+    matcher_step: int = STEP
     normal_network: str = ""
     without: tuple[str, ...] = ()
 
     def __post_init__(self):
         if not 0 <= self.gaussians <= MAX_LOBES:
             raise ValueError(f"gaussians={self.gaussians} is outside 0 to {MAX_LOBES}")
+        if not 1 <= self.matcher_step <= 90 or 360 % self.matcher_step:
+            raise ValueError(f"matcher_step={self.matcher_step} is no divisor of 360 from 1 to 90")
         for name in self.without:
             if name not in WITHOUT:
                 raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
@@ -64,6 +70,7 @@ PRESETS = {
         "level_steps": (150, 200),
         "rays": 4096,
         "faces": 8_000,
+        "outlines": 3,
         "texture": 256,
         "surface_steps": 300,
         "points": 2048,

@@ -132,7 +132,8 @@ def match_instances(shots: list[Shot], run, options: DuplicatesOptions, seed: in
     windows = [(v.rgb, v.mask, offset) for v, offset in zip(full, offsets, strict=True)]
     with quiet(load_pycolmap()):
         if options.matcher:
-            features, links = link_by_matcher(load_matcher(options.matcher), windows, cameras, error, sweep=sweep)
+            matcher, step = load_matcher(options.matcher), options.matcher_step
+            features, links = link_by_matcher(matcher, windows, cameras, error, sweep=sweep, step=step)
         else:
             features = [find_features(*w) for w in windows]
             links = link_instances(features, cameras, error, sweep=sweep)

@@ -91,7 +91,7 @@ def errors(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, o: Surface
         dr.eval(surface.base, surface.roughness, surface.metallic)
         lights = sample_lights(mesh, points, surface, model.environment, o.directions, rng)
         a, b = reflected(points, lights, surface, model.environment)
-        value = dual_values(a, b, batch.rgb)
+        value = dual_values(a, b, batch.rgb, bank.saturated)
         keep = np.array(points.valid)
         uv = np.clip((np.array(points.uv).T * size).astype(int), 0, size - 1)[keep]
         group = vq(colour[uv[:, 1], uv[:, 0]], centres)[0]

@@ -3,7 +3,7 @@
     photos     decode, carry the cameras to the unit frame
     hull       visual hull of the masks, opened where the photos contradict it     fit/hollows.py
     volume     signed distance field by volume rendering, shaded by the flash at each rendered point     rendering/shade_flash.py
-    mesh       zero level set, decimated; texture atlas; albedos of each vertex
+    mesh       zero level set, decimated; outlines as the masks have them; texture atlas; albedos of each vertex     fit/outlines.py
     surface    rough-plastic textures, normal map and flash by exact direct light and estimated inter-reflection   fit/flash_surface.py
     asset      textures with filled gutters, everything back in the frame of the user's cameras
 
@@ -28,7 +28,8 @@ from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_s
 from relit.fit.hollows import HollowOptions, open_hollows, without
 from relit.fit.kinship import start_kinship
 from relit.fit.multiview import load_pixels, rotation_from_y, run_arrays, score_held_out
-from relit.fit.pixels import PixelBank
+from relit.fit.outlines import follow_outlines
+from relit.fit.pixels import SATURATED, PixelBank
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -36,6 +37,7 @@ from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.masks.threshold import Backdrop
+from relit.materials.plastic_as_gltf import base_colour
 from relit.materials.plastic_field import MOST_SPECULAR, plastic_pictures, start_plastic
 from relit.materials.rough_plastic import IOR, Coat
 from relit.rendering.shade import features_at
@@ -45,6 +47,8 @@ from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
 
 LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
+# 120 photos of 400x400 took 150 s and 1.6 GB at standard, half of it the volume pass, half the surface pass; a fifth at draft
+COST = {"draft": (30.0, 0.9e9), "standard": (147.0, 1.2e9), "high": (450.0, 2.5e9)}
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
 COARSE_FACES = 20_000  # of the mesh on which the volume pass's inter-reflection is estimated
 PLACE = 0.15  # how much a unit length counts beside a display value when places are compared
@@ -56,12 +60,14 @@ START_ALBEDO, MEAN_COSINE, START_WIDTH = 0.4, 0.7, 0.2
 class FlashOptions:
     """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. max_pixels: photos are
     shrunk until all together have no more. shadows: soft visibility in the last level of the volume pass.
-    faces: of the mesh, about. texture: texels a side. surface_steps, points: steps of the surface pass, pixels per step.
+    faces: of the mesh, about. outlines: rounds in which it follows the masks (fit/outlines.py). texture: texels a side.
+    surface_steps, points: steps of the surface pass, pixels per step.
     hollows: nodes a side of the search for concavities that no silhouette shows (fit/hollows.py), 0 for none.
     directions: of inter-reflection per pixel and estimate. bounces: of it. ior: index of refraction of the coat.
     smooth: weight of the material's smoothness. patches: weight of PIR's pyramid and SSIM terms, none by default.
     dino: an ONNX file of a DINO network whose features tell which places are alike, or `hub:OWNER/NAME/PATH` to fetch it; what the
-    capture itself tells where empty. without: parts that are switched off, names of WITHOUT.
+    capture itself tells where empty. check_light: refuse photos whose light clearly does not move with the camera. without: parts that are
+    switched off, names of WITHOUT.
     """
 
     levels: tuple[int, ...] = (96, 192)
@@ -71,6 +77,7 @@ class FlashOptions:
     shadows: bool = True
     hollows: int = 64
     faces: int = 60_000
+    outlines: int = 3
     texture: int = 512
     surface_steps: int = 2000
     points: int = 8192
@@ -80,6 +87,7 @@ class FlashOptions:
     smooth: float = 0.0003
     patches: float = 0.0
     dino: str = ""
+    check_light: bool = True
     without: tuple[str, ...] = ()
 
     def __post_init__(self):
@@ -100,6 +108,7 @@ PRESETS = {
         "rays": 4096,
         "max_pixels": 8_000_000,
         "faces": 20_000,
+        "outlines": 2,
         "texture": 256,
         "surface_steps": 400,
         "points": 4096,
@@ -140,6 +149,7 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     check_backdrop(capture)
     bank, cameras, masks, level = load_pixels(capture, options, run)
     check_photos(bank, cameras, masks, level)
+    bank.saturated = bank.ignored = saturation(capture)
     coat = Coat(options.ior)
     if options.dino and not run.done("surface"):
         DinoNetwork(network_file(options.dino))  # what is wrong with it is told before anything is computed
@@ -148,18 +158,18 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     else:
         model = volume_stage(bank, cameras, masks, level, coat, run, options, seed)
         score_held_out(capture, model, run, np.eye(4))
-        parts = mesh_stage(model, run, options)
+        parts = mesh_stage(model, cameras, masks, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
     else:
-        maps = surface_stage(bank, cameras, mesh, parts, coat, saturation(capture), run, options, seed)
+        maps = surface_stage(bank, cameras, mesh, parts, coat, bank.saturated, run, options, seed)
     return assemble(capture, mesh, maps, world_from_unit, options.ior)
 
 
 def saturation(capture: Capture) -> float:
     """The linear value from which on a pixel may be over-exposed: photos in EXR or HDR are not clipped."""
-    return np.inf if all(p.name.lower().endswith((".exr", ".hdr")) for p in capture.photos) else 0.99
+    return np.inf if all(p.name.lower().endswith((".exr", ".hdr")) for p in capture.photos) else SATURATED
 
 
 def check_backdrop(capture: Capture) -> None:
@@ -260,11 +270,13 @@ def look_around(bank: PixelBank, cameras: list[Camera], model: VolumeModel, coat
     model.appearance.around = ambient.around(values, coat)
 
 
-def mesh_stage(model: VolumeModel, run, options: FlashOptions) -> dict[str, np.ndarray]:
-    """Mesh, atlas, and what the volume pass knows of each vertex. Returns (and keeps) vertices, faces, normals, uvs, albedo (V, 4:
-    diffuse and specular), alpha (V,), offset (3,), intensity."""
+def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: FlashOptions) -> dict[str, np.ndarray]:
+    """Mesh, its outlines where the masks have them, atlas, and what the volume pass knows of each vertex. Returns (and keeps) vertices,
+    faces, normals, uvs, albedo (V, 4: diffuse and specular), alpha (V,), offset (3,), intensity."""
     with run.stage("mesh", title="mesh and atlas") as stage:
-        mesh, how = unwrap(extract_mesh(dense_values(model.grid), faces=options.faces), options.texture)
+        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
+        rounds = 0 if "refinement" in options.without else options.outlines
+        mesh, how = unwrap(follow_outlines(mesh, cameras, masks, rounds), options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
         learnt = np.array(model.reflections)
@@ -337,7 +349,9 @@ def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_fr
         normals=(mesh.normals @ (asset_from_unit[:3, :3] / radius).T).astype(np.float32),
     )
     roughness = np.sqrt(maps["alpha"])
-    material = Material(maps["diffuse"], roughness, np.zeros((1, 1), np.float32), ior, maps["specular"], maps["normal"])
+    base = base_colour(maps["diffuse"], roughness, maps["specular"], ior)
+    metallic = np.zeros((1, 1), np.float32)
+    material = Material(base, roughness, metallic, ior, maps["specular"], maps["normal"], maps["diffuse"])
     flash = Flash(maps["offset"].astype(np.float64) * radius, np.full(3, float(maps["intensity"][0]) * radius**2))
     cameras = tuple((p.name, p.camera) for p in capture.photos)
     return Asset(placed, material, world_from_asset, None, cameras, {"material": "rough_plastic"}, flash)

@@ -19,7 +19,7 @@ from relit.fit.flash_patches import draw_patches, pyramid_loss, ssim_loss
 from relit.fit.kinship import Kinship, share_evidence
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight
-from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.pixels import PixelBank, batch_of, draw_pixels, well_exposed
 from relit.fit.preview import surface_preview
 from relit.fit.surface import neighbours
 from relit.lighting.flash import light_position
@@ -40,7 +40,8 @@ class FlashSurfaceOptions:
     between neighbours up to reach apart, of like features (to about width). share: length of the like places' common step
     (fit/kinship.py), taken every share_every steps; own: part of what a texel has to itself that is kept per step.
     slope_*: the normal map (see SurfaceOptions of fit/surface.py). offset_z: weight of |Δo_z|. alpha_range: of alpha beyond .5.
-    saturated: linear value from which on a pixel is over-exposed.
+    saturated: linear value from which on a pixel is over-exposed: it has no say over lobes and patches then, and none over a texel that is
+    brighter yet.
     patches: weight of the Gaussian-pyramid and SSIM terms of PIR Eq. 9; pixels are then drawn in patches (fit/flash_patches.py).
     """
 
@@ -140,7 +141,8 @@ def fit_flash_surface(
         sigma = dr.opaque(mi.Float, o.robust[0] ** (1 - e) * o.robust[1] ** e)
         fit = robust_loss(a, b, batch.rgb, valid, calm, sigma, o.saturated)
         if o.patches > 0:
-            alike = pyramid_loss(a, b, batch.rgb, dr.select(valid, calm, 0)) + ssim_loss(a, b, batch.rgb, valid)
+            counts = valid & well_exposed(batch.rgb, o.saturated)
+            alike = pyramid_loss(a, b, batch.rgb, dr.select(counts, calm, 0)) + ssim_loss(a, b, batch.rgb, counts)
             fit += dr.opaque(mi.Float, o.patches) * alike
         bend = slope.x * points.t + slope.y * points.b
         prior = material_prior(model, plastic, points, near, valid, o) + slope_prior(field, bend, close, valid, o)
@@ -173,7 +175,8 @@ def fit_flash_surface(
         n, position, intensity, bounce, plastic = (dr.detach(v) for v in (n, position, intensity, bounce, plastic))
         photo = batch.rgb - bounce
         now = direct(points, plastic, model.coat, n, position, intensity, seen)
-        weight = display_weight(batch.rgb) * dr.select(points.valid, calm * robust_weight(now - photo, batch.rgb, sigma), 0)
+        counts = points.valid & well_exposed(batch.rgb, o.saturated)
+        weight = display_weight(batch.rgb) * dr.select(counts, calm * robust_weight(now - photo, batch.rgb, sigma), 0)
         dr.eval(n, position, intensity, photo, weight, plastic)
         shade = lambda p: direct(points, p, model.coat, n, position, intensity, seen)  # noqa: E731
         told, _ = plastic_at(beginning, points.uv, points.valid)

@@ -31,6 +31,7 @@ from relit.fit.register import (
 # weights in fit.register's descriptors: one photo, one light, so brightness tells more than across photos; colourful objects do with less
 # of it; whether another pose would do as well is judged in detail
 PARTS, COLOURFUL, DETAILED = (0.5, 2.0, 0.6), (0.6, 2.0, 0.1), (0.6, 1.0, 0.1, 0.6)
+STILL = 0.5  # degrees; descents that turn instances by less have arrived
 APART = 25.0  # degrees from which on a pose is another one
 UNSURE = 0.3  # see `ambiguous`
 GAP = 0.1  # an instance's score may lie so much below those of the best third
@@ -45,7 +46,8 @@ class Search:
     poses are grown from, at most, for each descriptor. convincing: share of the way from chance to a perfect score at which no other start
     is tried. rounds: of fit and search for all instances. descents, descent_rate: fits of shape and poses together that follow, and the
     step of the poses in them. rate: of the pose corrections in other coarse fits. depth: see `carved`. doubted, rounds_doubted: instances
-    that are searched once more against a model of the others, and how often at most.
+    that are searched once more against a model of the others, and how often at most. late: descents that follow where one has moved, at
+    most.
     """
 
     nodes: int = 40
@@ -61,8 +63,9 @@ class Search:
     descent_rate: float = 0.012
     rate: float = 0.004
     depth: float = 2.5
-    doubted: int = 6
-    rounds_doubted: int = 2
+    doubted: int = 12
+    rounds_doubted: int = 5
+    late: int = 3
     growth: Growth = field(default_factory=Growth)
 
 
@@ -268,9 +271,17 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         say(f"note: the poses are uncertain, {skill:.2f} above chance where {o.convincing:.2f} convinces: is the object nearly symmetric?")
     poses, scores = settle(views, crops, rings[parts], poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
     poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
+    detail = crop_rings(crops, DETAILED)  # colour alone puts a spotted cow on any of its white sides
+    late = False
     for turn in range(o.rounds_doubted if o.descents and len(views) > 2 else 0):
-        poses, scores, moved = reconsider(views, crops, rings[parts], poses, scores, o, seed=seed + 30 + turn, parts=parts, say=say)
+        poses, scores, moved = reconsider(views, crops, detail, poses, scores, o, seed=seed + 30 + turn, parts=DETAILED, say=say)
         if not moved:
             break
+        late = True
         poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 40 + turn, parts=parts, say=say)
+    for turn in range(o.late if late else 0):  # those that came late have had the fewest descents, and hold the others back
+        before = poses.copy()
+        poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 50 + turn, parts=parts, say=say)
+        if np.median([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(before, poses, strict=True)]) < STILL:
+            break
     return poses, scores

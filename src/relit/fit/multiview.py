@@ -3,7 +3,7 @@
     photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
     hull       visual hull of the masks, or without masks the fused depths of a radiance field of the whole scene   fit/explore.py
     volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
-    mesh       zero level set, decimated; texture atlas; mean radiance per vertex
+    mesh       zero level set, decimated; outlines as the masks have them; texture atlas; mean radiance per vertex   fit/outlines.py
     surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/first_material.py, fit/surface.py
     asset      textures with filled gutters, everything back in the frame of the user's cameras
 """
@@ -24,6 +24,7 @@ from relit.fit.explore import explore, first_shape
 from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.hollows import without
 from relit.fit.lids import FIRST, open_lids
+from relit.fit.outlines import follow_outlines
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras, sphere_pixels
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
@@ -49,9 +50,10 @@ class MultiviewOptions:
     visual hull that are asked whether they are lids (fit/lids.py). max_pixels: photos are shrunk until all together have no more.
     refine_cameras: step of the camera corrections in the volume pass (0: cameras are exact). normal: weight of normal priors read from
     files. background, explore_steps: nodes a side of the radiance field for photos without masks, and the steps that fit it.
-    faces: of the mesh, about. texture: texels a side. surface_steps, points, directions: steps of the surface pass, pixels per step,
-    directions per pixel. light_steps: after so many of them the light rests (0: never). light: rows of the environment map. without:
-    parts of the surface pass that are switched off, names of WITHOUT.
+    faces: of the mesh, about. outlines: rounds in which the mesh follows the masks (fit/outlines.py). texture: texels a side.
+    surface_steps, points, directions: steps of the surface pass, pixels per step, directions per pixel. light_steps: after so many of
+    them the light rests (0: never). light: rows of the environment map. without: parts of the surface pass that are switched off, names
+    of WITHOUT.
     """
 
     levels: tuple[int, ...] = (128, 256)
@@ -64,6 +66,7 @@ class MultiviewOptions:
     background: int = 96
     explore_steps: int = 400
     faces: int = 40_000
+    outlines: int = 3
     texture: int = 512
     surface_steps: int = 3000
     light_steps: int = 1200
@@ -104,6 +107,7 @@ PRESETS = {
         "background": 64,
         "explore_steps": 200,
         "faces": 12_000,
+        "outlines": 2,
         "texture": 256,
         "surface_steps": 700,
         "light_steps": 500,
@@ -158,7 +162,7 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
     else:
         model = volume_stage(bank, cameras, masks, level, run, options, seed)
         score_held_out(capture, model, run, refined_cameras(cameras, run, options)[1])
-        parts = mesh_stage(model, run, options)
+        parts = mesh_stage(model, cameras, masks, run, options)
     cameras, parts = follow_cameras(bank, cameras, parts, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
 
@@ -175,10 +179,15 @@ def refined_cameras(cameras: list[Camera], run, options: MultiviewOptions) -> tu
     together with the shape, so both are carried back to where the cameras were. Unchanged, and the identity, where cameras are exact."""
     if options.refine_cameras <= 0:
         return cameras, np.eye(4)
-    found = corrected(cameras, run_arrays(run, "volume", "checkpoint")["corrections"])
+    found = found_cameras(cameras, run, options)
     poses = np.array([c.world_from_camera for c in found])
     unit_from_found = align_cameras(poses, np.array([c.world_from_camera for c in cameras]))
     return [c.with_pose(move_pose(unit_from_found, pose)) for c, pose in zip(found, poses, strict=True)], unit_from_found
+
+
+def found_cameras(cameras: list[Camera], run, options: MultiviewOptions) -> list[Camera]:
+    """The cameras (unit frame) as the shape of the volume pass has them, with its corrections where they are refined."""
+    return cameras if options.refine_cameras <= 0 else corrected(cameras, run_arrays(run, "volume", "checkpoint")["corrections"])
 
 
 def follow_cameras(bank: PixelBank, cameras: list[Camera], parts: dict[str, np.ndarray], run, options: MultiviewOptions):
@@ -293,11 +302,14 @@ def score_held_out(capture: Capture, model: VolumeModel, run, unit_from_found: n
     run.say(f"{len(scores)} photos set aside: {mean:.2f} dB ({definition})")
 
 
-def mesh_stage(model: VolumeModel, run, options: MultiviewOptions) -> dict[str, np.ndarray]:
-    """Mesh, atlas, and the mean radiance of each vertex. Returns (and keeps) vertices, faces, normals, uvs, radiance."""
+def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: MultiviewOptions) -> dict[str, np.ndarray]:
+    """Mesh, its outlines where the masks have them, atlas, and the mean radiance of each vertex. Returns (and keeps) vertices, faces,
+    normals, uvs, radiance."""
     with run.stage("mesh", title="mesh and atlas") as stage:
-        values = dense_values(model.grid)
-        mesh, how = unwrap(extract_mesh(values, faces=options.faces), options.texture)
+        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
+        if masks is not None:
+            mesh = follow_outlines(mesh, found_cameras(cameras, run, options), masks, options.outlines)
+        mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
         parts = {

@@ -14,6 +14,7 @@ from relit.cameras.se3 import exp_so3
 from relit.scene import Camera
 
 ZOOM = 4.0  # a focal length is known less well than a pose is: it moves so much faster
+SATURATED = 0.99  # of photos whose values end at 1
 CAMERA_FLOATS = 16  # fx fy cx cy, then the 3x4 pose row by row
 
 
@@ -22,7 +23,8 @@ class PixelBank:
     """views, total: counts of photos and pixels. rgbm: Float [total * 4], linear RGB and mask. normals: Float [total * 4] or None
     (camera axes, last entry 1 where known). cameras: Float [views * 16]. offsets, widths: UInt32 [views]. candidates: UInt32, the
     pixels that batches are drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector, translation) or
-    [views * 7] or [views * 8] (see `rays_through`)."""
+    [views * 7] or [views * 8] (see `rays_through`). saturated: linear value from which on a pixel says only "at least this bright".
+    ignored: the one from which on it has no say in the volume pass; infinite: none."""
 
     views: int
     total: int
@@ -34,6 +36,8 @@ class PixelBank:
     candidates: Any
     masked: bool
     corrections: Any
+    saturated: float = SATURATED
+    ignored: float = np.inf
 
 
 @dataclass
@@ -93,6 +97,7 @@ def make_bank(cameras: list[Camera], images: list[np.ndarray], masks: list[np.nd
         mi.UInt32(np.concatenate(candidates)),
         masked,
         dr.zeros(mi.Float, 6 * len(images)),
+        np.inf if max(float(im.max(initial=0)) for im in images) > 1.001 else SATURATED,  # radiance is not clipped in EXR and HDR
     )
 
 
@@ -183,6 +188,11 @@ def batch_of(bank: PixelBank, pixel, corrections=None) -> RayBatch:
         batch.normal = mi.Vector3f(*[r.x * q.x + r.y * q.y + r.z * q.z for r in k])
         batch.has_normal = q.w
     return batch
+
+
+def well_exposed(rgb, saturated: float):
+    """Bool: no channel of a Color3f is over-exposed; True (a Python bool) where nothing can be."""
+    return True if np.isinf(saturated) else dr.max(rgb) < saturated
 
 
 def draw_pixels(bank: PixelBank, rng, count: int):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image as PilImage
-from PIL import ImageCms, ImageOps, UnidentifiedImageError
+from PIL import ImageCms, UnidentifiedImageError
 
 from relit.errors import UserError
 
@@ -61,14 +61,15 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
             return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, **flip), True
     with pil(path) as image:
         try:
+            orientation = orientation_of(image) if upright else 1
             if _is_sixteen_bit(path, suffix):
-                return _sixteen_bit(path, image.getexif().get(0x0112, 1) if upright else 1), False
-            image = ImageOps.exif_transpose(image) if upright else image
+                array = _sixteen_bit(path, orientation)
+                return (_finite(array, path), True) if array.dtype.kind == "f" else (array, False)  # floats are linear
             if image.mode in ("P", "PA") or "transparency" in image.info:
                 image = image.convert("RGBA")
             elif image.mode in ("1", "CMYK", "YCbCr", "HSV", "LAB"):
                 image = image.convert("L" if image.mode == "1" else "RGB")
-            array = np.array(standard_colours(image) if colours else image)
+            array = turn_upright(np.array(standard_colours(image) if colours else image), orientation)
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
     if array.dtype == np.int32:  # PIL's mode I: 16-bit grey
@@ -112,6 +113,18 @@ def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
     if array.ndim == 3:
         array = array[..., [2, 1, 0, 3][: array.shape[2]]] if array.shape[2] >= 3 else array
     return turn_upright(array, orientation)
+
+
+def early_exif(image: PilImage.Image) -> PilImage.Exif:
+    """EXIF by what stands before the pixels: Pillow decodes a whole PNG to look for more. Ask before the pixels are loaded."""
+    known = image.format != "PNG" or image.info.keys() & {"exif", "Raw profile type exif", "XML:com.adobe.xmp"}
+    return image.getexif() if known else PilImage.Exif()
+
+
+def orientation_of(image: PilImage.Image) -> int:
+    """EXIF's orientation, 1 to 8; the one place that decides it, so that size and pixels agree."""
+    value = early_exif(image).get(0x0112, 1)
+    return value if value in range(1, 9) else 1
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:

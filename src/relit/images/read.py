@@ -10,11 +10,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image as PilImage
-from PIL import ImageOps
 
 from relit.conventions import linear_from_srgb
 from relit.errors import UserError
-from relit.images.decode import FLOAT, RAW, broken, checked, decode, exr, hdr_size, pil, raw_file, standard_colours
+from relit.images.decode import (
+    FLOAT,
+    RAW,
+    broken,
+    checked,
+    decode,
+    early_exif,
+    exr,
+    hdr_size,
+    orientation_of,
+    pil,
+    raw_file,
+    standard_colours,
+    turn_upright,
+)
 from relit.images.write import codes_of
 
 FULL_FRAME_DIAGONAL = 43.2666  # mm, of the 36 x 24 mm film that "35 mm equivalent" focal lengths refer to
@@ -87,7 +100,7 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
     """
     path = Path(path)
     suffix = checked(path)
-    if suffix in FLOAT | RAW:
+    if suffix in FLOAT | RAW or (suffix in (".tif", ".tiff") and _is_float(path)):
         image = read_image(path, upright)
         h, w = image.rgb.shape[:2]
         size = (max(1, round(w * side / max(w, h))), max(1, round(h * side / max(w, h)))) if max(w, h) > side else (w, h)
@@ -95,18 +108,24 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
         return Image(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), alpha)
     with pil(path) as image:
         try:
+            orientation = orientation_of(image) if upright else 1
             image.draft("RGB", (side, side))
             has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
             if image.mode.startswith("I"):
-                codes = read_data(path)
-                image = PilImage.fromarray(codes_of(codes))
+                array, _ = decode(path, upright=False, colours=False)
+                image = PilImage.fromarray(codes_of(_unit(array)))
             small = image.convert("RGBA" if has_alpha else "RGB")
-            small = ImageOps.exif_transpose(small) if upright else small
             small = small.reduce(max(1, max(small.size) // side)) if max(small.size) >= 2 * side else small
-            array = _unit(np.array(standard_colours(small)))
+            array = turn_upright(_unit(np.array(standard_colours(small))), orientation)
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
     return Image(linear_from_srgb(array[..., :3]), array[..., 3] if has_alpha else None)
+
+
+def _is_float(path: Path) -> bool:
+    """Is it a TIFF of grey floats (Pillow's mode F)?"""
+    with pil(path) as image:
+        return image.mode == "F"
 
 
 def read_data(path: str | Path) -> np.ndarray:
@@ -134,10 +153,7 @@ def read_header(path: str | Path) -> Header:
         return Header(w, h, False, _raw_focal(path, w, h), orientation)
     with pil(path) as image:
         w, h = image.size
-        # Pillow decodes a whole PNG to look for EXIF behind the pixels; what stands before them is enough here
-        exif = image.getexif() if image.format != "PNG" or "exif" in image.info else PilImage.Exif()
-        orientation = exif.get(0x0112, 1)
-        orientation = orientation if orientation in range(1, 9) else 1
+        orientation, exif = orientation_of(image), early_exif(image)
         w, h = (h, w) if orientation >= 5 else (w, h)
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
         return Header(w, h, has_alpha, _focal(exif, w, h), orientation)

@@ -9,20 +9,24 @@ import numpy as np
 
 from relit.errors import UserError
 from relit.images import EXTENSIONS, read_data
+from relit.images.decode import CODED, pil
 
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr")
 FOLDERS = ("masks", "mask", "segmentations", "silhouettes")
 BORDER = 0.9  # an inverted mask covers at least this share of the photo's border
 
 
 def find_mask(photo: Path, root: Path, index: dict[str, Path]) -> Path | None:
     """The mask of a photo: STEM_mask.png or STEM.mask.png beside it, else a file of the same name, stem or number in a mask folder."""
-    for name in (f"{photo.stem}_mask", f"{photo.stem}.mask"):
-        for suffix in (".png", ".jpg"):
+    bare = photo.stem.removesuffix("_rgb")  # Synthetic4Relight: 000_rgb.exr, 000_mask.png
+    for name in dict.fromkeys((f"{photo.stem}_mask", f"{photo.stem}.mask", f"{bare}_mask")):
+        for suffix in (*MASK_SUFFIXES, *map(str.upper, MASK_SUFFIXES)):
             if (photo.parent / (name + suffix)).is_file():
                 return photo.parent / (name + suffix)
     relative = photo.relative_to(root).as_posix() if photo.is_relative_to(root) else photo.name
     without_top = relative.split("/", 1)[-1]
-    for key in (without_top + ".png", without_top, str(Path(without_top).with_suffix("")), photo.name, photo.stem, f"{photo.stem}_mask"):
+    exact = [k for r in (relative, without_top) for k in (r + ".png", r, str(Path(r).with_suffix("")))]  # train/000 before 000
+    for key in (*exact, photo.name, photo.stem, f"{photo.stem}_mask"):
         if key in index:
             return index[key]
     number = _number(photo.stem)
@@ -69,7 +73,21 @@ def read_mask(path: Path) -> np.ndarray:
         if alpha.min() < 0.5 < alpha.max():
             return alpha
         data = data[..., :-1]
-    return data.mean(axis=-1)
+    return _of_palette(data) if _indexed(path) else data.mean(axis=-1)
+
+
+def _indexed(path: Path) -> bool:
+    """Is it a picture with a palette whose first colour is black? DAVIS and VOC number their objects so."""
+    if path.suffix.lower() not in CODED:
+        return False
+    with pil(path) as image:
+        return image.mode == "P" and image.getpalette()[:3] == [0, 0, 0]
+
+
+def _of_palette(rgb: np.ndarray) -> np.ndarray:
+    """(H, W) of (H, W, 3): every colour but black is an object, dark red too; grey levels as they are, unless none is bright."""
+    soft = rgb.max() > 0.5 and (rgb == rgb[..., :1]).all()
+    return rgb[..., 0] if soft else rgb.any(axis=-1).astype(np.float32)
 
 
 def border_share(mask: np.ndarray) -> float:

@@ -7,10 +7,12 @@ Four regimes: 'fixed' (the object and the lamps stand still, the camera moves), 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 
+from relit.errors import UserError
 from relit.preflight.look import Look, look_at_photos
 from relit.scene import Capture, Sphere
 
@@ -19,6 +21,11 @@ SAME_PLACE = 0.45  # overlap of the surroundings' colours; .54 and .70 in one ro
 DARK = 0.02  # linear: surroundings of a flash photo
 CELLS = (24, 48)  # of the object sphere's directions
 SAMPLES = 1500  # pixels of a photo
+FOLLOWS = "what faces the camera is brightest: the light moves with it"
+NO_LIMB = 0.6  # below it no lamp stands at the camera
+NO_FRONT = 0.6  # likewise, share of the photos that are lit from the front
+ENOUGH = 12  # photos: in fewer the paint of the object can look like light from a side
+BLACK, BURNT = 0.004, 0.98  # linear: such an object shows no shading
 LIMB = 1.2  # log brightness per unit of an inflated mask's normal, towards the camera; 1.5 to 3 under a flash, below .6 elsewhere
 
 
@@ -53,6 +60,37 @@ def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
         "confidence": round(float(np.clip((votes[guess] - others) / max(votes[guess], 0.5), 0.05, 0.95)), 2),
         "evidence": evidence,
     }
+
+
+def check_flash_light(capture: Capture, say: Callable[[str], None], looks: list[Look] | None = None) -> None:
+    """Raises UserError where the photos were clearly not lit by a flash at the camera; says so where that is uncertain.
+
+    Clear is one viewpoint under a moving lamp, or, in ENOUGH photos, an object that does not darken towards its outlines: a lamp at the
+    camera makes it, whatever it is made of and whatever surrounds it. looks: as for `light_regime`.
+    """
+    looks = look_at_photos(capture) if looks is None else looks
+    regime, slopes = light_regime(capture, looks), limb_slopes(looks)
+    fired = [x.exif.flash for x in looks if x.exif.flash is not None]
+    follows = (bool(fired) and float(np.mean(fired)) > 0.5) or any(FOLLOWS in e for e in regime["evidence"])
+    elsewhere = len(slopes) >= ENOUGH and not follows and np.median(slopes[:, 2]) < NO_LIMB and _frontal(slopes) < NO_FRONT
+    if regime["guess"] == "flash" and not elsewhere:  # dark surroundings alone are no flash: renderings on black have them too
+        return
+    onward = "to go on all the same: --set check_light=false"
+    if regime["guess"] == "moving light":
+        raise UserError(
+            "all photos are taken from one place, under a light that moves from photo to photo",
+            "a flash capture goes around the object, and the light goes with the camera; from one side there is no shape to find",
+            f"photograph from all around the object with the flash at the camera; {onward}",
+        )
+    seen = "; ".join(regime["evidence"])
+    if elsewhere:
+        raise UserError(
+            f"the light does not move with the camera: it looks {'varied' if regime['guess'] == 'varied' else 'fixed'}",
+            "under a flash an object darkens evenly towards its outline; "
+            f"here it does in {100 * _frontal(slopes):.0f} % of the photos. {seen}",
+            f"take --capture {'collection' if regime['guess'] == 'varied' else 'multiview'}; {onward}",
+        )
+    say(f"note: the light does not look like a flash at the camera, which is uncertain ({seen}); if it was none, the material is wrong")
 
 
 # ---------------------------------------------------------------- one camera
@@ -170,11 +208,15 @@ def _limb(looks: list[Look], votes: dict, evidence: list[str]) -> None:
     slopes = limb_slopes(looks)
     if len(slopes) < 3:
         return
-    sideways = np.hypot(slopes[:, 0], slopes[:, 1])
-    frontal = float((slopes[:, 2] > sideways).mean())
+    frontal = _frontal(slopes)
     if np.median(slopes[:, 2]) > LIMB and frontal > 0.8:
         evidence.append(f"in {100 * frontal:.0f} % of the photos the object darkens evenly towards its outline: lit from the camera")
         votes["flash"] += 1.2
+
+
+def _frontal(slopes: np.ndarray) -> float:
+    """Share of the photos in which brightness goes with the normal's component to the camera more than to any side."""
+    return float((slopes[:, 2] > np.hypot(slopes[:, 0], slopes[:, 1])).mean())
 
 
 def limb_slopes(looks: list[Look]) -> np.ndarray:
@@ -184,6 +226,8 @@ def limb_slopes(looks: list[Look]) -> np.ndarray:
     for x in looks:
         inside = None if x.mask is None else x.mask > 0.9
         if inside is None or not 200 <= inside.sum() < 0.9 * inside.size:
+            continue
+        if not BLACK < np.median(x.gray[inside]) < BURNT:
             continue
         far = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
         height = cv2.GaussianBlur(np.sqrt(far * far.max()), (0, 0), max(1.5, 0.03 * float(np.sqrt(inside.sum()))))
@@ -209,7 +253,7 @@ def _shading(looks: list[Look], sphere: Sphere, votes: dict, evidence: list[str]
         f"{100 * camera:.0f} % of that goes with the direction to the camera, {100 * photo:.0f} % with the photo"
     )
     if spread > 0.2 and camera > 0.3 and facing > 0.3:
-        evidence.append("what faces the camera is brightest: the light moves with it")
+        evidence.append(FOLLOWS)
         votes["flash"] += 0.9
     elif spread > 0.3 and photo > 0.5:
         votes["varied"] += 0.8

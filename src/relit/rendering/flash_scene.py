@@ -100,13 +100,14 @@ def _register(variant: str) -> None:
 
 
 def build_flash_scene(mesh: Mesh, material: Material, world_from_asset=None) -> FlashScene:
-    """The scene in the world frame. material: base_color is the diffuse albedo, specular the factor on the coat, alpha = roughness²."""
+    """The scene in the world frame. material: its `diffuse` is the diffuse albedo, or base_color where that is None; specular the factor on
+    the coat, alpha = roughness²."""
     if material.normal is not None and mesh.uvs is None:
         raise UserError("the material has a normal map but the mesh has no texture coordinates", fix="give it uvs, or drop the map")
     world_from_asset = np.eye(4) if world_from_asset is None else np.asarray(world_from_asset, np.float64)
     specular = np.ones((1, 1), np.float32) if material.specular is None else np.asarray(material.specular, np.float32)
     t = {
-        "base_color": _texture(material.base_color, color=True),
+        "base_color": _texture(material.base_color if material.diffuse is None else material.diffuse, color=True),
         "roughness": _texture(material.roughness),
         "specular": _texture(specular.mean(-1) if specular.ndim == 3 else specular),
         "normalmap": None if material.normal is None else _texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),

@@ -33,7 +33,7 @@ def edit_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
     out_flag(parser, "asset folder to write; with --photo also photo.png in it")
     add, more = parser.common.add_argument, parser.more.add_argument
-    add("--photo", type=Path, default=None, metavar="FILE", help="the photo of a duplicates run: it is changed as well")
+    add("--photo", type=Path, default=None, metavar="FILE", help="a photo of the run, known by its name or content: it is changed as well")
     add("--tint", type=colour, default=None, metavar="R,G,B", help="multiplies the base colour")
     add("--base-color", type=colour, default=None, metavar="R,G,B", help="linear, in place of the texture")
     add("--roughness", type=float, default=None, help="a constant in place of the map")
@@ -69,7 +69,7 @@ def insert_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder of a duplicates capture")
     out_flag(parser, "picture to write")
     add, more = parser.common.add_argument, parser.more.add_argument
-    add("--photo", type=Path, required=True, metavar="FILE", help="the photo of the run")
+    add("--photo", type=Path, required=True, metavar="FILE", help="a photo of the run, known by its name or content")
     add("--model", type=Path, required=True, metavar="FILE", help=".glb, .gltf, .obj or an asset folder")
     add("--at", type=pixel, required=True, metavar="X,Y", help="pixel of the photo where it stands on the ground")
     add("--size", type=float, default=1.0, help="of its bounding sphere, in that of the recovered object (default 1)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from relit.verbs.parser import DEVICES, KINDS, QUALITIES, Parser, free, job_flags, opening_flags, out_flag, path_in
+from relit.verbs.parser import DEVICES, OPENING, QUALITIES, Parser, capture_flag, free, job_flags, opening_flags, out_flag, path_in
 
 # ---------------------------------------------------------------- doctor, demo, inspect
 
@@ -37,6 +37,7 @@ def do_demo(args) -> None:
 def inspect_flags(parser: Parser) -> None:
     path_in(parser, "input", "folder of photos, transforms.json, COLMAP model, ...")
     parser.common.add_argument("--json", action="store_true", help="print JSON")
+    capture_flag(parser)
     parser.common.add_argument("--quality", choices=QUALITIES, default="standard", help="for the estimate of time and memory")
     parser.common.add_argument("--plot", type=Path, default=None, metavar="FILE.svg", help="draw the cameras around the object sphere")
     parser.common.add_argument("--html", type=Path, default=None, metavar="FILE.html", help="a page with all that was looked at")
@@ -53,7 +54,8 @@ def do_inspect(args) -> None:
     for path in (args.plot, args.html):
         if path is not None:
             free(path, overwrite=False)
-    job = Job(quality=args.quality, masks=args.masks or "auto", sphere=args.sphere, max_side=args.max_side)
+    names = ("capture", "quality", *OPENING)
+    job = Job(**{name: value for name in names if (value := getattr(args, name)) is not None})
     if args.edit:
         from relit.plan import open_as
         from relit.viewer.correct import correction_server
@@ -72,12 +74,11 @@ def reconstruct_flags(parser: Parser) -> None:
     path_in(parser, "input", "folder of photos, transforms.json, COLMAP model, ... (docs/formats.md)")
     out_flag(parser, "run folder; giving the same command again resumes")
     add = parser.common.add_argument
-    add("--capture", choices=("auto", *KINDS), default=None, help="what kind of photos (default auto)")
+    capture_flag(parser)
     job_flags(parser, None)
     add("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs", help="one setting of the recipe; may be repeated")
     add("--config", type=Path, default=None, metavar="FILE.toml", help="settings from a file, a run's config.toml too; flags win")
     opening_flags(parser)
-    parser.more.add_argument("--focal", type=float, default=None, metavar="PIXELS", help="known focal length, for photos without cameras")
     parser.more.add_argument("--overwrite", action="store_true", help="remove what an earlier run left in the folder and begin anew")
 
 
@@ -93,10 +94,7 @@ def do_reconstruct(args) -> None:
         seed=args.seed,
         pairs=args.pairs,
         config=args.config,
-        masks=args.masks,
-        sphere=args.sphere,
-        max_side=args.max_side,
-        focal=args.focal,
+        **{name: getattr(args, name) for name in OPENING},
         overwrite=args.overwrite,
     )
     print(asset / "object.glb")

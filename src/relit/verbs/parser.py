@@ -112,12 +112,20 @@ def job_flags(parser: Parser, quality: str | None) -> None:
     add("--seed", type=int, default=None, help="same seed, same result within tolerance on the CPU (default 0)")
 
 
+def capture_flag(parser: Parser) -> None:
+    parser.common.add_argument("--capture", choices=("auto", *KINDS), default=None, help="what kind of photos (default auto)")
+
+
+OPENING = ("masks", "sphere", "max_side", "focal")  # what `opening_flags` give, fields of `relit.plan.Job`
+
+
 def opening_flags(parser: Parser) -> None:
     """Flags that say how the input is to be read."""
     add = parser.more.add_argument
     add("--masks", default=None, metavar="HOW", help="auto (default), none, alpha, files, threshold, grabcut, segment[:NETWORK]")
     add("--sphere", type=sphere, default=None, metavar="X,Y,Z,R", help="ball that holds the object, in the frame and unit of the cameras")
     add("--max-side", type=int, default=None, metavar="PIXELS", help="shrink photos whose longer side is longer")
+    add("--focal", type=float, default=None, metavar="PIXELS", help="known focal length, for photos without cameras")
 
 
 def sphere(text: str) -> tuple[float, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 from relit.capture.corrections import corrected_masks, corrected_sphere, forget_mask, save_mask, save_sphere, sphere_from_boxes
 from relit.errors import UserError
 from relit.images import encode_jpeg
+from relit.masks.grabcut import box_cut
 from relit.scene import Capture, Photo
 from relit.viewer.photos import shrunk
 from relit.viewer.serve import Server, open_port
@@ -23,6 +24,7 @@ def correction_server(capture: Capture, port: int = 0) -> Server:
     """A server of the page for this capture; what is saved there counts when the capture is opened the next time."""
     photos = (*capture.photos, *capture.held_out)
     root = capture.root if capture.root.is_dir() else capture.root.parent
+    may_cut = capture.kind != "duplicates"  # one box knows one object, and the mask of a pile is of all
 
     def index(query: str) -> Photo:
         i = int(parse_qs(query)["i"][0])
@@ -36,7 +38,8 @@ def correction_server(capture: Capture, port: int = 0) -> Server:
         sphere = corrected_sphere(root) or capture.sphere
         circles = [_circle(p, sphere) for p in photos] if sphere is not None else [None] * len(photos)
         facts = [f"{len(photos)} photos", capture.format]
-        return {"mode": "edit", "title": root.name, "facts": facts, "photos": listed, "circles": circles, "boxes": capture.has_cameras}
+        offered = {"boxes": capture.has_cameras, "cut": may_cut}
+        return {"mode": "edit", "title": root.name, "facts": facts, "photos": listed, "circles": circles, **offered}
 
     def photo(query: str) -> tuple[bytes, str]:
         return encode_jpeg(shrunk(index(query).load().rgb, SIDE)), "image/jpeg"
@@ -67,8 +70,30 @@ def correction_server(capture: Capture, port: int = 0) -> Server:
         save_sphere(root, sphere)
         return {"centre": sphere.centre.tolist(), "radius": sphere.radius}
 
-    posts, pictures = {"mask": keep_mask, "boxes": keep_boxes}, {"photo.jpg": photo, "mask.png": mask}
+    def keep_cut(body: bytes, _: str) -> dict:
+        entry = json.loads(body)
+        p = index(f"i={int(entry['i'])}")
+        if not may_cut:
+            raise UserError("a pile has no single box", "its mask shows all objects", "paint, or change the label image")
+        save_mask(root, p, mask_in_box(p, entry["box"]))
+        return {"corrected": True}
+
+    posts, pictures = {"mask": keep_mask, "boxes": keep_boxes, "cut": keep_cut}, {"photo.jpg": photo, "mask.png": mask}
     return open_port(lambda: Server(root, {"manifest.json": state}, posts, pictures, port), port)
+
+
+def mask_in_box(p: Photo, box: list) -> np.ndarray:
+    """(H, W) in [0, 1]: what GrabCut finds in a box (x0, y0, x1, y1), pixels of what is painted on. Raises UserError."""
+    w, h = _size(p)
+    x0, y0, x1, y1 = np.clip([float(v) for v in box], 0, (w, h, w, h))
+    if not (min(x1 - x0, y1 - y0) >= 4 and (x1 - x0) * (y1 - y0) < 0.98 * w * h):
+        raise UserError(
+            "the box is too small, or holds the whole photo", "what lies outside tells what is not the object", "draw it closely round it"
+        )
+    mask = box_cut(shrunk(p.load().rgb, SIDE), (x0, y0, x1, y1))
+    if not mask.any():
+        raise UserError("nothing stands out in the box", "object and surroundings have the same colours", "paint the mask")
+    return mask
 
 
 def _size(p: Photo) -> tuple[int, int]:

@@ -1,0 +1,119 @@
+"""The mesh follows the masks to a part of a pixel."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from relit.cameras.se3 import exp_so3
+from relit.fit.outlines import Outline, follow_outlines, follow_with_poses, laplacian, outline_of, solve, trace
+from relit.geometry.tangents import vertex_normals
+from relit.rendering.mitsuba_scene import build_geometry
+from relit.scene import Camera, Mesh
+
+SIZE, FOCAL = 96, 220.0
+
+
+def looking_at_origin(direction) -> Camera:
+    z = -np.asarray(direction, float) / np.linalg.norm(direction)
+    x = np.cross(z, [0.3, 0.9, 0.1])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], 1), -3 * z
+    return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
+
+
+def ring(count: int = 24) -> list[Camera]:
+    k = np.arange(count) + 0.5
+    y, turn = 1 - 2 * k / count, k * np.pi * (3 - np.sqrt(5))
+    return [looking_at_origin(d) for d in np.stack([np.sqrt(1 - y * y) * np.cos(turn), y, np.sqrt(1 - y * y) * np.sin(turn)], -1)]
+
+
+def ball(radius=0.5) -> Mesh:
+    shape = trimesh.creation.icosphere(4, 1.0)
+    v = np.asarray(shape.vertices)
+    return Mesh((v * radius).astype(np.float32), np.asarray(shape.faces, np.int32), v.astype(np.float32))
+
+
+def coverage(mesh: Mesh, camera: Camera, side: int = 8) -> np.ndarray:
+    part = (np.arange(side) + 0.5) / side
+    y, x = np.mgrid[:SIZE, :SIZE]
+    at = np.broadcast_arrays(x[..., None, None] + part, y[..., None, None] + part[:, None])
+    met = np.isfinite(trace(build_geometry(mesh), camera, at[0].ravel(), at[1].ravel())[0])
+    return met.reshape(SIZE, SIZE, side * side).mean(-1).astype(np.float32)
+
+
+def shifted(mask: np.ndarray, dx: int, dy: int) -> np.ndarray:
+    return np.roll(mask, (dy, dx), (0, 1))
+
+
+@pytest.fixture(scope="module")
+def seen():
+    cameras, truth = ring(), ball()
+    return cameras, [coverage(truth, c) for c in cameras]
+
+
+def test_an_outline_that_lies_too_far_out_is_told_in_pixels(seen):
+    mesh, camera = ball(0.505), seen[0][0]
+    found = outline_of(mesh, build_geometry(mesh), camera, seen[1][0])
+    each = FOCAL / 3 / (1 - (0.5 / 3) ** 2) ** 1.5  # d/dr of FOCAL tan(asin(r / 3))
+    assert np.median(found.scale) == pytest.approx(each, rel=0.03)
+    assert np.median(found.shift) == pytest.approx(-0.005 * each, abs=0.05)
+
+
+def test_a_dented_ball_becomes_round(seen):
+    cameras, masks = seen
+    truth = ball()
+    bump = 0.008 * np.sin(6 * truth.vertices[:, 0] / 0.5) + 0.006  # .6 of a pixel at most, wider than a pixel
+    start = Mesh((truth.vertices * (1 + bump[:, None] / 0.5)).astype(np.float32), truth.faces)
+    start = replace(start, normals=vertex_normals(start))
+    out = follow_outlines(start, cameras, masks, 3)
+    error = lambda m: np.sqrt(np.mean((np.linalg.norm(m.vertices, axis=1) - 0.5) ** 2))  # noqa: E731
+    assert error(out) < 0.25 * error(start)
+    assert np.allclose(np.linalg.norm(out.normals, axis=1), 1, atol=1e-5)
+    turned = lambda m: np.arccos(np.clip((m.normals * truth.normals).sum(1), -1, 1)).mean()  # noqa: E731
+    assert turned(out) < 0.5 * turned(start)
+
+
+def test_masks_that_contradict_one_another_move_less(seen):
+    cameras, masks = seen
+    rng = np.random.default_rng(0)
+    loose = [shifted(m, *rng.integers(-1, 2, 2)) for m in masks]
+    moved = lambda found: np.abs(np.linalg.norm(follow_outlines(ball(), cameras, found, 1).vertices, axis=1) - 0.5).max()  # noqa: E731
+    assert moved(masks) < 0.0015  # a tenth of a pixel
+    assert moved(loose) < 0.01  # the masks are wrong by up to 1.4 pixels, .019
+
+
+def test_no_outline_no_move(seen):
+    mesh = ball()
+    empty = Outline(np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    assert not solve(mesh, [empty]).any()
+    still = follow_outlines(mesh, seen[0], seen[1], 0)
+    assert still is mesh
+
+
+def test_the_laplacian_of_what_is_even_is_nothing():
+    mesh = ball()
+    assert np.abs(laplacian(mesh.faces, len(mesh.vertices)) @ np.ones(len(mesh.vertices))).max() < 1e-9
+
+
+def test_poses_follow_too():
+    shape = trimesh.creation.box([0.7, 0.5, 0.9]).subdivide_loop(4)  # an egg with no symmetry of turning
+    truth = Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.int32))
+    truth = replace(truth, normals=vertex_normals(truth))
+    cameras = ring(8)
+    masks = [coverage(truth, c) for c in cameras]
+    rng = np.random.default_rng(1)
+    wrong = []
+    for c in cameras:
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = exp_so3(rng.normal(0, 0.001, 3)), rng.normal(0, 0.004, 3) * [1, 1, 5]
+        wrong.append(c.with_pose(c.world_from_camera @ motion))
+    known = [np.ones_like(m) for m in masks]
+    for k in known[:4]:
+        k[: SIZE // 2, : SIZE // 2] = 0  # a quarter is hidden by something else
+    hidden = [m * k for m, k in zip(masks, known, strict=True)]
+    _, found = follow_with_poses(truth, wrong, hidden, known)
+    error = lambda poses: np.std([np.linalg.inv(p)[2, 3] for p in poses])  # noqa: E731  (all together may be nearer to a smaller object)
+    assert error(found) < 0.3 * error([c.world_from_camera for c in wrong])
