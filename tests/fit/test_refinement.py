@@ -10,6 +10,7 @@ from relit.cameras.se3 import camera_errors
 from relit.capture import open_capture
 from relit.conventions import move_points
 from relit.fit.multiview import MultiviewOptions, reconstruct
+from relit.images import read_data, write_linear
 from relit.run import Run
 from relit.scene import Sphere
 
@@ -66,19 +67,25 @@ def volume_only(folder, out, normal):
     return distance_to_truth(world_vertices(asset))
 
 
-def test_normal_priors_from_files_help_and_the_wrong_sign_hurts(photos, tmp_path):
-    """The same photos, with true normals, none, and normals that point the other way."""
-    flipped = tmp_path / "flipped"
-    flipped.mkdir()
-    from relit.images import read_data, write_linear
-
+def with_normals(photos, folder, signs):
+    """The same photos, with their normals times `signs` (x, y, z of the camera axes)."""
+    folder.mkdir()
     for file in photos.iterdir():
-        if "_normal" not in file.name:
-            (flipped / file.name).write_bytes(file.read_bytes())
+        if "_normal" in file.name:
+            write_linear(folder / file.name, np.array(signs, np.float32) * read_data(file)[..., :3])
         else:
-            write_linear(flipped / file.name, -read_data(file)[..., :3])
+            (folder / file.name).write_bytes(file.read_bytes())
+    return folder
+
+
+def test_normal_priors_from_files_help_and_those_that_look_away_are_refused(photos, tmp_path):
+    """The same photos, with true normals, none, normals with x the other way, and normals that look away from the camera."""
+    mirrored, away = with_normals(photos, tmp_path / "mirrored", (-1, 1, 1)), with_normals(photos, tmp_path / "away", (-1, -1, -1))
     assert any("16 photos have normal priors" in n for n in open_capture(photos, sphere=BALL).notes)
     none = volume_only(photos, tmp_path / "none", 0.0)
     true = volume_only(photos, tmp_path / "true", 0.3)
-    wrong = volume_only(flipped, tmp_path / "wrong", 0.3)
-    assert true < 0.9 * none < none < wrong
+    wrong = volume_only(mirrored, tmp_path / "wrong", 0.3)  # z is still right
+    assert true < 0.7 * none and true < 0.7 * wrong
+    refused = open_capture(away, sphere=BALL)
+    assert any("normal priors are not used" in n and "look away from the camera" in n for n in refused.notes)
+    assert all(photo.load().normal is None for photo in refused.photos)
