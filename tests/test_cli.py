@@ -244,3 +244,18 @@ def test_convert_refuses_what_it_does_not_know():
         convert("x", types.SimpleNamespace)
     with pytest.raises(ValueError):
         convert(True, int)
+
+
+@pytest.mark.parametrize("stop, code", [("KeyboardInterrupt", 130), ("Terminated", 143)])
+def test_a_stopped_command_ends_with_its_code_whatever_native_threads_do(stop, code):
+    """A stop may come while a native module is half loaded; what the interpreter does at its end then aborts."""
+    job = f"""
+import atexit, os
+from relit import cli, run
+atexit.register(os.abort)
+def stopped(argv): raise {"run.Terminated" if stop == "Terminated" else stop}
+cli._dispatch = stopped
+cli.command()
+"""
+    done = subprocess.run([sys.executable, "-c", job], capture_output=True, text=True)
+    assert done.returncode == code and done.stderr.splitlines()[-1] == ("terminated" if stop == "Terminated" else "interrupted")

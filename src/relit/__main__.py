@@ -1,8 +1,6 @@
 """`python -m relit`: the same as the `relit` command."""
 
-import sys
-
-from relit.cli import main
+from relit.cli import command
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command()

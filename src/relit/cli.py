@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 from relit import __version__
@@ -36,6 +36,17 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_OK
     except BaseException as raised:
         return _answer(stopped_by(raised), argv)
+
+
+def command() -> None:
+    """The `relit` command: ends the process with the exit code of `main`."""
+    code = main()
+    if code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)  # Dr.Jit's threads may be at work, or half loaded: the interpreter's own end would abort
+    sys.exit(code)
 
 
 def _answer(error: BaseException, argv: list[str]) -> int:
@@ -131,4 +142,4 @@ def _keep(text: str, argv: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command()
