@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -26,16 +27,15 @@ def run(capsys, *argv):
 
 
 def test_help_is_quick():
-    best = 9.0
-    for _ in range(3):
-        begun = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "relit", "reconstruct", "--help"], check=True, capture_output=True)
-        best = min(best, time.perf_counter() - begun)
+    before = os.times()
+    subprocess.run([sys.executable, "-m", "relit", "reconstruct", "--help"], check=True, capture_output=True)
+    after = os.times()
+    spent = after.children_user + after.children_system - before.children_user - before.children_system
     job = "import sys; from relit.cli import main; main(['evaluate', '--help']); "
     job += "print('LOADED', {'mitsuba', 'scipy', 'cv2'} & set(sys.modules))"
     out = subprocess.run([sys.executable, "-c", job], check=True, capture_output=True, text=True).stdout
     assert out.endswith("LOADED set()\n")
-    assert best < 1.0  # 0.2 s on an idle machine
+    assert spent < 1.0  # of processor time, which other work leaves alone; 0.2 s usually
 
 
 def test_overview_lists_what_there_is(capsys):
