@@ -99,6 +99,12 @@ def test_objects_that_show_too_different_sides_are_said():
     assert len(said) == 1 and "lie 70 degrees apart" in said[0]
 
 
+def test_without_the_search_one_set_that_matches_hold_together_is_left():
+    told = ((0, 3, None), (3, 4, None), (1, 2, None))
+    assert poses_stage.linked_together(6, told).tolist() == [True, False, False, True, True, False]
+    assert not poses_stage.linked_together(3, ()).any()
+
+
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile), unsure=90.0)
     capture = open_capture(pile)
