@@ -71,6 +71,8 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     shots = [(with_normals(p.load(), options), p.camera.with_pose(np.eye(4))) for p in photos]
     if len(photos) > 1 and all(len(np.unique(pixels.labels[pixels.labels > 0])) == 1 for pixels, _ in shots):
         run.say(f"note: one object in {len(photos)} photos: it is placed by search; from all around --capture multiview is more exact")
+    if "normals" in options.without and not options.normal_network and all(pixels.normal is None for pixels, _ in shots):
+        run.say("note: without=normals changes nothing: no photo has normal priors")
     poses, registered, keys, unsure = poses_stage(shots, run, options, seed)
     chosen = [k for k in range(len(keys)) if registered[k]]
     views = [v for v in all_views(shots, options.side, options) if v.key in {keys[k] for k in chosen}]
