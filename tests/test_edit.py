@@ -15,10 +15,12 @@ from relit.conventions import similarity
 from relit.edit import as_shown, camera_of, edit, insert
 from relit.errors import UserError
 from relit.files import digests
-from relit.images import read_image, write_srgb
+from relit.images import read_data, read_image, write_linear, write_srgb
+from relit.relight import relight
 from relit.rendering.mitsuba_scene import build_scene, render
+from relit.rendering.photographed import as_photographed
 from relit.rendering.pile import build_pile, instance_ids
-from relit.scene import Asset, Camera, Ground, Instance
+from relit.scene import Asset, Camera, Flash, Ground, Instance
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +105,42 @@ def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):
 
         asset = load_asset(folder)
         standing(asset.mesh, asset, look_up, (36, 5), 1.0, 0.0)
+
+
+@pytest.mark.parametrize("kind", ["collection", "flash"])
+def test_a_photo_is_changed_under_its_own_light(run, tmp_path, kind):
+    """Of a collection it is four times as bright as the median of the lights; of a flash capture there is no environment at all."""
+    pile = load_asset(run[0])
+    one = replace(pile, instances=(), ground=None, world_from_asset=np.eye(4))
+    if kind == "collection":
+        asset = replace(one, lights=(4 * one.environment, one.environment), cameras=(one.cameras[0], ("other.png", one.cameras[0][1])))
+    else:
+        material = replace(one.material, diffuse=one.material.base_color, metallic=np.zeros((1, 1), np.float32))
+        flash = Flash(np.array([-0.5, 0.2, 0.0]), np.full(3, 60.0))
+        asset = replace(one, material=material, environment=None, flash=flash)
+    shown = as_photographed(asset)("photo.png", asset.cameras[0][1], spp=64)
+    write_srgb(tmp_path / "photo.png", np.clip(shown[..., :3], 0, 1))
+    edit(save_asset(tmp_path / "asset", asset), tmp_path / "same", photo=tmp_path / "photo.png", tint=(1, 1, 1), spp=32)
+    before, after = read_image(tmp_path / "photo.png").rgb, read_image(tmp_path / "same" / "photo.png").rgb
+    inside = shown[..., 3] > 0.99
+    assert before[inside].mean() > 0.05 and after[inside].mean() == pytest.approx(before[inside].mean(), rel=0.08)
+    edit(tmp_path / "asset", tmp_path / "dark", photo=tmp_path / "photo.png", tint=(0.2, 0.2, 0.2), spp=32)
+    assert read_image(tmp_path / "dark" / "photo.png").rgb[inside].mean() < 0.75 * before[inside].mean()
+
+
+def test_the_pile_under_another_light(run, tmp_path):
+    """From the photo's camera all objects on their ground; on a turntable the object alone."""
+    folder, asset = run[0], load_asset(run[0])
+    write_linear(tmp_path / "even.exr", np.ones((8, 16, 3), np.float32))
+    file = relight(folder, tmp_path / "even.exr", tmp_path / "photo", cameras="capture", spp=8, exr=True)[1]
+    shown, camera = read_data(file), asset.cameras[0][1]
+    bare = render(build_scene(asset.mesh, asset.material, asset.world_from_asset, np.ones((8, 16, 3), np.float32)), camera, spp=8)
+    for x in (-1.0, 1.0):
+        u, v, _ = camera.project(np.array([x, 0.6, 0.0])).astype(int)
+        assert np.ptp(shown[v, u, :3]) > 0.05, x  # the objects are coloured
+    assert (shown[..., 3] > 0.99).mean() > 0.7 > (bare[..., 3] > 0.99).mean()  # the ground
+    turned = read_data(relight(folder, tmp_path / "even.exr", tmp_path / "orbit", cameras="orbit:1", size=48, spp=8, exr=True)[1])
+    assert turned[0, 0, 3] == 0 and turned[-1, 0, 3] == 0
 
 
 def test_another_photo_is_refused(run, tmp_path):

@@ -1,4 +1,5 @@
-"""The photo of a pile of duplicates, changed: another material, an instance taken away, a new object put in, under the recovered light.
+"""A photo, changed: another material, of a pile of duplicates an instance taken away, a new object put in, under the recovered light (of a
+collection the photo's own, of a flash capture the flash at that camera).
 
 Differential rendering (Debevec 1998, Sec. 4): where the changed thing itself is seen, the picture is rendered; everywhere else the photo
 stays, plus what the change does to it (render after minus render before): contact shadows and inter-reflections fall on what was
@@ -22,6 +23,7 @@ from relit.files import digests
 from relit.images import read_image, write_srgb
 from relit.materials.plastic_as_gltf import base_colour, diffuse_albedo
 from relit.rendering.mitsuba_scene import build_scene, render
+from relit.rendering.photographed import as_photographed
 from relit.rendering.pile import build_pile, instance_ids, joined
 from relit.scene import Asset, Camera, Material, Mesh
 
@@ -72,8 +74,8 @@ def edit(
     written = [save_asset(out, changed)]
     if photo is not None:
         name, camera, picture = _photo(asset, photo)
-        before, ids = _rendered(asset, camera, spp, seed)
-        after, new_ids = _rendered(changed, camera, spp, seed)
+        before, ids = _rendered(asset, name, camera, spp, seed)
+        after, new_ids = _rendered(changed, name, camera, spp, seed)
         same = material is asset.material
         shown, told = np.array([i.label for i in asset.instances if i.registered] + [0])[ids], _labels_beside(photo, ids.shape)
         if told is not None and name != asset.cameras[0][0]:
@@ -207,12 +209,17 @@ def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.nd
     return (total / samples).reshape(camera.height, camera.width)
 
 
-def _rendered(asset: Asset, camera: Camera, spp: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The pile's picture (H, W, 3) and which registered instance each pixel shows, -1 for none."""
+def _rendered(asset: Asset, name: str, camera: Camera, spp: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the photo `name` shows (H, W, 3), under its own light where it has one, and which registered instance each pixel shows, -1 for
+    none."""
     poses = [i.world_from_object for i in asset.instances if i.registered] or [asset.world_from_asset]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
-    scene = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
-    return render(scene, camera, spp=spp, seed=seed)[..., :3], instance_ids(scene, pile, camera)
+    light = dict(zip((n for n, _ in asset.cameras), asset.lights, strict=False)).get(name, asset.environment)
+    scene = build_scene(pile.mesh, pile.material, np.eye(4), np.ones((8, 16, 3), np.float32) if light is None else light)
+    ids = instance_ids(scene, pile, camera)
+    if asset.flash is not None:
+        return as_photographed(asset)(name, camera, spp=spp, seed=seed)[..., :3], ids
+    return render(scene, camera, spp=spp, seed=seed)[..., :3], ids
 
 
 def _labels_beside(photo: str | Path, shape: tuple[int, int]) -> np.ndarray | None:
@@ -229,7 +236,7 @@ def _labels_beside(photo: str | Path, shape: tuple[int, int]) -> np.ndarray | No
 
 def _photo(asset: Asset, photo: str | Path) -> tuple[str, Camera, np.ndarray]:
     """Which of the run's photos it is (the name in `asset.cameras`), its camera and its linear pixels. Raises UserError when it is none."""
-    if asset.environment is None or not asset.cameras:
+    if (asset.environment is None and asset.flash is None) or not asset.cameras:
         raise UserError("the asset has no camera or no light of its own", fix="give a run of `relit reconstruct`")
     picture = read_image(Path(photo)).rgb
     name, camera = camera_of(asset, Path(photo))

@@ -16,7 +16,8 @@ from relit.conventions import move_points, move_pose, rotate_environment, srgb_f
 from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError
 from relit.images import read_image, write_linear, write_srgb
 from relit.lighting.spherical_gaussians import environment_of, read_json
-from relit.rendering.mitsuba_scene import build_scene, render
+from relit.rendering.mitsuba_scene import render
+from relit.rendering.photographed import lit_scene
 from relit.scene import Asset, Camera, Material
 
 FRAMES_PER_SECOND = 24
@@ -47,6 +48,7 @@ def relight(
     in the asset's own `lights/` stands in the world frame, as it was recovered. rotate: turns the light about the object's up, degrees.
     cameras: 'capture' (the asset's own), 'orbit:N' (a turntable of N pictures), or a transforms.json in the world frame.
     out: a folder (PNG on black, sRGB, clipped at 1; also linear RGBA .exr with exr=True) or FILE.mp4 (24 pictures a second).
+    Of duplicates cameras of the world show all instances on their ground, a turntable the object alone.
     size: longer side in pixels. albedo_scale: number or 3 that multiply the base colour. progress: called with (done, all).
     """
     out, light = Path(out), Path(light)
@@ -57,7 +59,7 @@ def relight(
     views = _views(asset, cameras, size)
     environment = _placed_light(light, folder, asset, rotate)
     material = asset.material if albedo_scale is None else _scaled(asset.material, albedo_scale)
-    scene = build_scene(asset.mesh, material, asset.world_from_asset, environment)
+    scene = lit_scene(replace(asset, material=material, environment=environment), whole=not str(cameras).startswith("orbit"))
     files = []
     video = out.suffix.lower() == ".mp4"
     with _video(out, views[0][1]) if video else _folder(out) as add:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from tiny_onnx import write_pointwise
 
 from relit.capture.networks import MEAN, SPREAD, Network, found_instances, predicted_normals
+from relit.conventions import similarity
 from relit.errors import UserError
+from relit.evaluate.duplicates import photo_figure
 from relit.plan import Job, open_as
+from relit.scene import Asset, Camera, Instance, Material, Mesh
 
 W, H = 160, 96
 
@@ -39,6 +43,24 @@ def test_a_photo_without_labels_and_a_segmenter(tmp_path):
     assert any("2 objects found by segmenter.onnx" in n for n in capture.notes)
     folder, _ = open_as(tmp_path, Job(capture="duplicates", masks=f"segment:{network}", focal=200.0))
     assert len(folder.photos) == 1
+
+
+def test_a_run_with_a_segmenter_is_measured_by_its_labels(tmp_path, device):
+    """There are no labels beside the photo: config.toml says which network told them."""
+    path, network = two_discs(tmp_path), segmenter(tmp_path / "segmenter.onnx")
+    (tmp_path / "run").mkdir()
+    ball = trimesh.creation.icosphere(3)
+    v, one = ball.vertices.astype(np.float32), np.ones((1, 1), np.float32)
+    material = Material(np.full((1, 1, 3), 0.5, np.float32), one, 0 * one)
+    poses = [similarity(np.eye(3), [(x - 80) / 20, (y - 48) / 20, 10.0], r / 20) for x, y, r in ((40, 48, 25), (115, 50, 30))]
+    instances = tuple(Instance(k + 1, pose) for k, pose in enumerate(poses))
+    camera = Camera(W, H, 200.0, 200.0, W / 2, H / 2, np.eye(4))
+    light = np.ones((8, 16, 3), np.float32)
+    asset = Asset(Mesh(v, ball.faces.astype(np.int32), v), material, poses[0], light, (("photo.png", camera),), instances=instances)
+    with pytest.raises(UserError, match="no photo of duplicates"):
+        photo_figure(asset, path, run=tmp_path / "run", spp=4)
+    (tmp_path / "run" / "config.toml").write_text(f'masks = "segment:{network}"\n')
+    assert 3 < photo_figure(asset, path, run=tmp_path / "run", spp=4) < 20  # a grey ball where a red and a blue disc are
 
 
 def test_without_a_segmenter_it_is_named_in_the_way_out(tmp_path):

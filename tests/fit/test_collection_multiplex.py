@@ -48,3 +48,41 @@ def test_what_takes_part():
     assert crops == ["a", "a", "b"] and np.allclose(shares, [0.6, 0.4, 0.95]) and np.allclose(poses, turned(0, 90, 10))
     refined = with_refined(state, np.stack([turned(84)[0], turned(12)[0]]))
     assert np.allclose(refined.poses[0], turned(0, 84, 180)) and np.allclose(refined.poses[1], turned(12, 100, 190))
+
+
+def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_searched_for(monkeypatch):
+    from types import SimpleNamespace
+
+    from relit.fit import collection, collection_held_out
+    from relit.fit.collection_options import CollectionOptions
+
+    kept = []
+    shots = [SimpleNamespace(direction=np.zeros(3))]
+    quiet = SimpleNamespace(say=lambda *_: None)
+    nothing = {"crops_of": [None], "crop_rings": None, "volume_render": None, "make_gallery": None}
+
+    def search(crops, gallery, keep, **_):
+        kept.append(keep)
+
+    def links(crops, groups, shots, hints, degrees, keep, *_):
+        kept.append(keep)
+
+    def poses(crops, directions, degrees, schedule, keep, *_, **__):
+        kept.append(keep)
+        return np.eye(4)[None], np.ones(1)
+
+    for name, value in nothing.items():
+        monkeypatch.setattr(collection_held_out, name, lambda *_, value=value: value)
+    for name in ("hint_prior", "near", "views_from"):
+        monkeypatch.setattr(collection_held_out, name, lambda *_: np.zeros((1, 1, 1), bool))
+    monkeypatch.setattr(collection_held_out, "replace", lambda model, **_: model)
+    monkeypatch.setattr(collection_held_out, "is_cut", lambda _: False)
+    monkeypatch.setattr(collection_held_out, "search", search)
+    monkeypatch.setattr(collection, "crops_of", lambda _: [None])
+    monkeypatch.setattr(collection, "poses_from_links", links)
+    monkeypatch.setattr(collection, "find_poses", poses)
+    for options, expected in ((CollectionOptions(keep=4), 4), (CollectionOptions(keep=4, without=("multiplex",)), 1)):
+        kept.clear()
+        collection_held_out.find(shots, None, 45.0, options, 0)
+        collection.find_all(shots, [], 45.0, quiet, options, 0)
+        assert kept == [expected] * 3

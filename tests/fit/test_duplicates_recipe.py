@@ -99,6 +99,12 @@ def test_objects_that_show_too_different_sides_are_said():
     assert len(said) == 1 and "lie 70 degrees apart" in said[0]
 
 
+def test_without_the_search_one_set_that_matches_hold_together_is_left():
+    told = ((0, 3, None), (3, 4, None), (1, 2, None))
+    assert poses_stage.linked_together(6, told).tolist() == [True, False, False, True, True, False]
+    assert not poses_stage.linked_together(3, ()).any()
+
+
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile), unsure=90.0)
     capture = open_capture(pile)
@@ -169,11 +175,12 @@ def test_one_object_in_several_photos_runs_and_says_what_it_is(pile, tmp_path, m
     told = true_poses(pile)[:1].repeat(2, 0)
     stand_in(monkeypatch, told)
     small = {"levels": (24,), "level_steps": (4,), "rays": 256, "faces": 500, "texture": 32, "surface_steps": 2, "points": 64}
-    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48, without=("matching",))
+    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48, without=("matching", "normals", "visibility"))
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(replace(capture, photos=(alone, alone)), run, options, 0)
         log = (run.folder / "log.txt").read_text()
     assert "one object in 2 photos" in log and "--capture multiview" in log
+    assert "without=normals changes nothing" in log
     assert len(asset.instances) == 1 and len(asset.cameras) == 2
 
 

@@ -8,6 +8,7 @@ import flash_ball as scene
 import numpy as np
 import pytest
 
+from relit.capture.photo import with_camera
 from relit.errors import UserError
 from relit.fit import flash
 from relit.fit.pixels import make_bank
@@ -36,6 +37,16 @@ def test_photos_before_a_bright_backdrop_are_refused():
     assert "--capture multiview" in error.value.fix
     for masks in ([Backdrop(True, 0.05)] * 3, [Path("a.png")] * 3, [None]):
         flash.check_backdrop(SimpleNamespace(photos=[photo(m) for m in masks]))
+
+
+def test_a_bright_backdrop_is_noticed_behind_a_lens_too():
+    """Cameras that structure from motion finds, and COLMAP's, have a distortion, and the photo is undistorted as it is read."""
+    camera = scene.cameras(1, 64)[0]
+    taken = Photo("a.jpg", SimpleNamespace(mask=Backdrop(False, 0.05)), 64, 64)
+    photo = with_camera(taken, replace(camera, distortion=(0.1, 0.0, 0.0, 0.0)))
+    assert photo.load is not taken.load
+    with pytest.raises(UserError, match="surroundings are not dark"):
+        flash.check_backdrop(SimpleNamespace(photos=[photo] * 3))
 
 
 def test_a_flash_that_did_not_fire(device):

@@ -9,7 +9,7 @@ from flash_ball import OFFSET, ball, bowl
 
 from relit.cameras.se3 import look_at
 from relit.fit.flash_ambient import find_ambient
-from relit.fit.flash_features import FlashView, capture_features
+from relit.fit.flash_features import FlashView, capture_features, seen_from
 from relit.fit.pixels import batch_of, make_bank
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import plastic_at, start_plastic
@@ -155,3 +155,25 @@ def test_a_ball_does_not_light_itself(device):
     camera = Camera(16, 16, 25.0, 25.0, 8.0, 8.0, look_at(np.array([0.0, 0.5, 3.0])))
     bank = make_bank([camera] * 3, [np.full((16, 16, 3), 0.3, np.float32)] * 3, [np.ones((16, 16), np.float32)] * 3)
     assert find_ambient(bank, [camera] * 3, mesh, Coat(), FlashView(np.array(OFFSET), 6.0), 0.8).light.max() < 1e-4
+
+
+def test_a_flash_that_throws_no_shadow_throws_none_anywhere(scene):
+    """A light low beside the bowl: its rim shades the bottom, from photos and from secondary hits, unless shadows are switched off."""
+    mesh, traceable, field, o, d = scene
+    camera = Camera(64, 64, 110.0, 110.0, 32.0, 32.0, look_at(np.array([0.3, 2.4, 0.0])))
+    bank = make_bank([camera], [np.ones((64, 64, 3), np.float32)], [np.ones((64, 64), np.float32)])
+    low = np.array([2.0, 0.5, 0.0])
+    offset = camera.world_from_camera[:3, :3].T @ (low - camera.centre)
+    x, n = (mi.Vector3f(np.ascontiguousarray(a[mesh.vertices[:, 1] < -0.5].T)) for a in (mesh.vertices, mesh.normals))
+    dr.eval(x, n)
+    for lit_only in (False, True):
+        dark, bright = (
+            np.array(seen_from(bank, camera, 0, traceable, x, n, FlashView(offset, 1.0, shadow), lit_only).ok) for shadow in (True, False)
+        )
+        assert bright.mean() > 0.9 and dark.mean() < 0.6
+    points = first_hits(traceable, o, d)
+    dr.eval(points)
+    plastic, _ = plastic_at(field, points.uv, points.valid)
+    args = (traceable, field, Coat(), points, plastic, points.n, mi.Vector3f(*low.tolist()), mi.Float(1))
+    shaded, open_ = (np.array(indirect(*args, mi.PCG32(size=dr.width(d), initstate=1), 1, shadow)).mean() for shadow in (True, False))
+    assert open_ > 1.2 * shaded

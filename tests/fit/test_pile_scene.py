@@ -99,3 +99,56 @@ def test_below_the_ground_is_the_ground():
     up, height = np.array([0, 1.0, 0]), environment_directions(32, 64)[..., 1]
     out = light_below(light, up, np.array([0.5, 0.4, 0.3]))
     assert np.allclose(out[height > 0], 2.0) and np.allclose(out[height < -0.1], [0.5, 0.4, 0.3])
+
+
+def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
+    """Two rows of balls that touch each other: together they block much of each other's sky, moved apart none of it."""
+    import drjit as dr
+    import mitsuba as mi
+    from flash_ball import ball as round_ball
+
+    from relit.fit.pile_scene import alone_bank, scene_mesh, spread
+    from relit.fit.pixels import batch_of
+    from relit.lighting.environment import Environment
+    from relit.materials.brdf import Surface
+    from relit.rendering.transport import TraceableMesh, first_hits, sample_lights
+    from relit.scene import Camera, Pixels
+
+    mesh = round_ball(16, 32)
+    camera = Camera(96, 64, 160.0, 160.0, 48.0, 32.0, np.eye(4))
+    standing = [similarity(np.eye(3), np.array([1.45 * x, -1.1 * z, 8 + 0.95 * z])) for z in (0, 1) for x in (-1, 0, 1)]
+    labels = np.zeros((64, 96), np.int32)
+    for k, pose in reversed(list(enumerate(standing))):  # the front row last
+        x, y, z = camera.project(pose[None, :3, 3])[0]
+        row, column = np.mgrid[:64, :96]
+        labels[np.hypot(column + 0.5 - x, row + 0.5 - y) < 150 * 0.7 / z] = 10 + k
+    labels[0, 0] = 99  # an object that is not registered
+    pixels = Pixels(np.random.default_rng(0).random((64, 96, 3)).astype(np.float32), labels=labels)
+    parts = {"radiance": np.ones((6, len(mesh.vertices), 3), np.float32), "plane": np.stack([[0, 0.7, 8.0], [0, -1.0, 0]])}
+    place = similarity(np.eye(3), np.array([0, 0, -8.7]))
+    moves = spread(standing, place)
+    own = camera.with_pose(place)
+    whole, radiance = scene_mesh(mesh, parts, standing, place, pixels, camera, moves)
+    assert whole.vertices.shape == (6 * len(mesh.vertices), 3) and (whole.uvs >= 0).all()
+    bank = alone_bank([pixels], [own], [{10 + k: k for k in range(6)}], moves, 10**6)
+    batch = batch_of(bank, bank.candidates)
+    traced = TraceableMesh(whole, radiance)
+    points = first_hits(traced, batch.o, batch.d)
+    hit = np.array(points.valid)
+    assert hit.mean() > 0.8 and set(np.array(batch.view)[hit].tolist()) == set(range(bank.views))
+    number = np.linalg.norm(np.array(points.x).T[hit][:, None] - (moves + [m[:3, 3] + place[:3, 3] for m in standing]), axis=2).argmin(1)
+    assert (np.array(batch.view)[hit] == number).all()  # each view shows the instance that it is of
+    count = dr.width(points.x)
+    grey = Surface(mi.Color3f(dr.full(mi.Float, 0.5, count)), dr.full(mi.Float, 0.5, count), dr.zeros(mi.Float, count))
+
+    def open_sky(scene, points):
+        rng = mi.PCG32(size=count, initstate=3)
+        light = Environment(dr.full(mi.Float, 1.0, 8 * 16 * 3), 8, 16)
+        drawn = sample_lights(scene, points, grey, light, 16, rng)
+        return np.average(np.array(drawn.visible), weights=np.array(drawn.weight) > 0)
+
+    assert open_sky(traced, points) > 0.995
+    together, radiance = scene_mesh(mesh, parts, standing, place, pixels, camera)
+    scene = TraceableMesh(together, radiance)
+    points.x = mi.Point3f(points.x - dr.gather(mi.Vector3f, mi.Float(moves.ravel().astype(np.float32)), batch.view))
+    assert open_sky(scene, points) < 0.75

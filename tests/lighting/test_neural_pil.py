@@ -35,6 +35,16 @@ def test_lights_and_their_derivative(tmp_path):
     assert np.allclose((network.pull_back(noise, gradient) * along).sum(1), expected, rtol=0.05, atol=0.05 * np.abs(expected).max())
 
 
+def test_a_file_as_numpy_names_its_arrays(tmp_path):
+    """`numpy.savez("network.npz", *arrays)`, as the guide says: arr_10 comes after arr_9, not after arr_1."""
+    write_network(tmp_path)
+    padded = load_neural_pil(tmp_path)
+    (tmp_path / "illumination-network_network.npz").unlink()
+    np.savez(tmp_path / "network.npz", *padded.weights)
+    plain = load_neural_pil(tmp_path)
+    assert all(np.array_equal(a, b) for a, b in zip(plain.weights, padded.weights, strict=True))
+
+
 def test_codes_stay_within_three_deviations(tmp_path):
     write_network(tmp_path)
     code, _ = load_neural_pil(tmp_path).codes(np.full((1, CODE), 50.0))

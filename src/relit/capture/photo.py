@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -82,6 +83,11 @@ class Undistorted:
         clipped = None if pixels.clipped is None else warp(pixels.clipped.astype(np.float32)) > 0
         normal = None if pixels.normal is None else _unit_normals(warp(pixels.normal))
         return Pixels(warp(pixels.rgb), warp(pixels.mask), normal, clipped)
+
+    @property
+    def mask(self) -> Any:
+        """Where the mask comes from, as `load` knows it."""
+        return getattr(self.load, "mask", None)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from relit.cameras.se3 import nearest_rotation, rotation_angle
 from relit.conventions import move_points, similarity, world_from_cv_camera
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.scene import Asset, Camera, Ground
+from relit.files import parse_toml
+from relit.scene import Asset, Camera, Ground, Pixels
 
 VISIBLE = 0.25  # share of an instance that must be seen for it to count among those to be registered
 SAMPLES = 30_000
@@ -161,7 +162,7 @@ def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 64, se
     from relit.asset.asset import load_asset
 
     asset, capture = load_asset(run), Path(capture)
-    values = {"photo_psnr": photo_figure(asset, capture, spp=spp, seed=seed)}
+    values = {"photo_psnr": photo_figure(asset, capture, run=Path(run), spp=spp, seed=seed)}
     reference = reference_poses(capture, asset.cameras[0][1])
     poses = {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
     if reference:
@@ -195,17 +196,29 @@ def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
     return out
 
 
-def photo_figure(asset: Asset, capture: Path, *, spp: int = 64, seed: int = 0) -> float:
-    """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr)."""
-    from relit.capture.sfd import open_duplicates, recognise
+def labelled_pixels(capture: Path, run: Path | None, focal: float) -> Pixels | None:
+    """The capture's first photo with its labels, of the network that the run's config.toml names where it names one. None where there are
+    no labels."""
+    from relit.capture.sfd import open_duplicates, open_segmented, recognise
+
+    config = run / "config.toml" if run else None
+    masks = str(parse_toml(config.read_text(encoding="utf-8")).get("masks", "")) if config and config.is_file() else ""
+    if masks.startswith("segment:"):
+        return open_segmented(capture, masks.split(":", 1)[1], focal=focal).photos[0].load()
+    source = recognise(capture)
+    return None if source is None else open_duplicates(source, focal=focal).photos[0].load()
+
+
+def photo_figure(asset: Asset, capture: Path, *, run: Path | None = None, spp: int = 64, seed: int = 0) -> float:
+    """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr). run: whose settings say where the labels are
+    from."""
     from relit.evaluate.photos import shrunk
     from relit.rendering.photographed import as_photographed
 
-    source = recognise(capture)
-    if source is None or not asset.cameras:
+    pixels = labelled_pixels(capture, run, asset.cameras[0][1].fx) if asset.cameras else None
+    if pixels is None:
         raise UserError("the capture is no photo of duplicates", fix=f"give the folder that the run was made from: {capture}")
     camera = asset.cameras[0][1]
-    pixels = open_duplicates(source, focal=camera.fx).photos[0].load()
     own = np.isin(pixels.labels, [i.label for i in asset.instances if i.registered])
     factor = min(1.0, PHOTO_SIDE / max(camera.width, camera.height))
     camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))

@@ -8,16 +8,14 @@ intensities (predicted over true), within the predicted mask, over the whole fra
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from relit.conventions import move_pose, scale_of
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.align import align_cameras, same_frame
 from relit.scene import Asset, Camera, Flash
 
 RATIO = "times the ratio of intensities, predicted over true (albedos and intensity share a factor)"
@@ -97,14 +95,9 @@ def load_flash_truth(folder: str | Path) -> FlashTruth:
 
 def placed(asset: Asset, truth: FlashTruth) -> Asset:
     """The asset in the frame of the true cameras: as it is where they were given, else moved, with its flash, by a similarity."""
-    recovered = {Path(name).stem: camera for name, camera in asset.cameras}
-    if not recovered or same_frame(recovered, truth.train):
-        return asset
-    s = align_cameras(recovered, truth.train)
-    k = scale_of(s)
-    cameras = tuple((name, camera.with_pose(move_pose(s, camera.world_from_camera))) for name, camera in asset.cameras)
-    flash = Flash(asset.flash.offset * k, asset.flash.intensity * k**2)
-    return replace(asset, world_from_asset=s @ asset.world_from_asset, cameras=cameras, flash=flash)
+    from relit.evaluate.protocols import aligned
+
+    return aligned(asset, truth.train, {Path(name).stem: camera for name, camera in asset.cameras})[0]
 
 
 def evaluate_flash(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:

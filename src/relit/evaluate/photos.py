@@ -1,4 +1,5 @@
-"""What is measured against photographs: the asset from the cameras of photos that the fit never saw, under the recovered light.
+"""What is measured against photographs: the asset from the cameras of photos that the fit never saw, under the recovered light: an
+environment, or the flash that moves with each camera.
 
 The truth is the capture itself. Where it sets photos aside (held-out frames of its format) those are compared; where it does not, the
 photos of the fit are, under another name ('seen_'): they show how well the asset explains what it was made from, not more.
@@ -12,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from relit.capture.flash_energy import flash_photos
 from relit.conventions import sample_environment
 from relit.errors import UserError
 from relit.evaluate import metrics as m
@@ -22,7 +24,7 @@ from relit.scene import Asset, Camera, Capture, Photo, Sphere
 SIDE = 512  # pixels; longer photos are shrunk by area averaging before they are compared
 SEEN = 12  # photos of the fit, evenly chosen, where none is set aside
 
-_SHOWN = f"photos shrunk to at most {SIDE} pixels a side, recovered light, recovered or given cameras"
+_SHOWN = f"photos shrunk to at most {SIDE} pixels a side, {{light}}, recovered or given cameras"
 _FIGURES = {
     "psnr": ("dB", f"{m.DEFINITIONS['psnr']}; the photo is multiplied with its mask"),
     "psnr_masked": ("dB", f"PSNR in dB of sRGB-encoded pictures clipped to [0, 1], over the pixels whose mask is >= {m.MASK}"),
@@ -42,10 +44,11 @@ _FIGURES = {
 }
 
 
-def definitions(prefix: str) -> dict[str, tuple[str, str]]:
+def definitions(prefix: str, light: str = "recovered light") -> dict[str, tuple[str, str]]:
     """name -> (unit, definition) of the figures over held-out ('held_out') or seen ('seen') photos."""
     which = "photos that were set aside and never used in the fit" if prefix == "held_out" else "photos of the fit itself"
-    return {f"{prefix}_{name}": (unit, f"{which}; {_SHOWN}: {text}; mean over photos") for name, (unit, text) in _FIGURES.items()}
+    shown = _SHOWN.format(light=light)
+    return {f"{prefix}_{name}": (unit, f"{which}; {shown}: {text}; mean over photos") for name, (unit, text) in _FIGURES.items()}
 
 
 def evaluate_on_photos(asset: Asset, folder: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0) -> dict[str, Any]:
@@ -54,22 +57,25 @@ def evaluate_on_photos(asset: Asset, folder: Path, *, run: Path | None = None, s
     Returns as `protocols.evaluate`. Raises UserError when the folder is no capture, has no cameras, or shares no photo with the asset.
     """
     from relit.evaluate.protocols import aligned, camera_key
-    from relit.rendering.mitsuba_scene import build_scene
+    from relit.rendering.photographed import as_photographed
 
-    if asset.environment is None:
-        raise UserError("the asset has no environment light", "its pictures cannot be compared with photos", "use relit relight instead")
+    if asset.environment is None and asset.flash is None:
+        why = "neither an environment nor a flash: its pictures cannot be compared with photos"
+        raise UserError("the asset has no light of its own", why, "use relit relight instead")
     capture = capture_of(folder, run)
+    if asset.flash is not None:
+        capture = flash_photos(capture)  # as the fit had them: those that the flash lit, all of one power
     if not capture.has_cameras:
         why = "photos can only be compared from known cameras; those of the run are in a frame of its own"
         raise UserError("the photos have no cameras and no truth", why, f"give a capture with cameras (docs/formats.md): {folder}")
     given = {camera_key(p.name): p.camera for p in capture.photos}
     asset, alignment = aligned(asset, given, {camera_key(name): camera for name, camera in asset.cameras})
     photos, prefix = chosen(capture)
-    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
-    per_view = {p.name: photo_figures(scene, asset, p, capture.sphere, spp, seed + i) for i, p in enumerate(photos)}
+    show = as_photographed(asset)
+    per_view = {p.name: photo_figures(show, asset, p, capture.sphere, spp, seed + i) for i, p in enumerate(photos)}
     names = [n for n in _FIGURES if any(n in v for v in per_view.values())]
     values = {n: float(np.nanmean([v[n] for v in per_view.values() if n in v])) for n in names}
-    meaning = definitions(prefix)
+    meaning = definitions(prefix, "recovered light" if asset.flash is None else "under the recovered moving flash")
     metrics = {}
     for name, value in values.items():
         unit, definition = meaning[f"{prefix}_{name}"]
@@ -98,15 +104,14 @@ def chosen(capture: Capture) -> tuple[list[Photo], str]:
     return [capture.photos[i] for i in index], "seen"
 
 
-def photo_figures(scene, asset: Asset, photo: Photo, sphere: Sphere | None, spp: int, seed: int) -> dict[str, float]:
-    """Figures of one photo, without prefix: the masked ones where its mask is known, else those of the object sphere."""
-    from relit.rendering.mitsuba_scene import render
-
+def photo_figures(show, asset: Asset, photo: Photo, sphere: Sphere | None, spp: int, seed: int) -> dict[str, float]:
+    """Figures of one photo, without prefix: the masked ones where its mask is known, else those of the object sphere. show: see
+    `rendering.photographed.as_photographed`."""
     pixels, camera = photo.load(), photo.camera
     factor = min(1.0, SIDE / max(camera.width, camera.height))
     camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
     rgb, mask = (shrunk(a, camera) for a in (pixels.rgb, pixels.mask))
-    shown = render(scene, camera, spp=spp, seed=seed)
+    shown = show(photo.name, camera, spp=spp, seed=seed)
     alpha = shown[..., 3]
     if mask is not None:
         a, b, inside = m.encode(shown[..., :3]), m.encode(rgb * mask[..., None]), mask >= m.MASK
@@ -117,7 +122,7 @@ def photo_figures(scene, asset: Asset, photo: Photo, sphere: Sphere | None, spp:
             "mask_iou": m.mask_iou(alpha, mask),
         }
     d = directions(camera)
-    behind = sample_environment(asset.environment, d) * (1 - alpha[..., None])
+    behind = 0.0 if asset.environment is None else sample_environment(asset.environment, d) * (1 - alpha[..., None])
     a, b = m.encode(shown[..., :3] + behind), m.encode(rgb)
     ball = np.ones(alpha.shape, bool) if sphere is None else meets(camera, d, sphere)
     covered = ball & (alpha >= m.MASK)

@@ -17,7 +17,7 @@ from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.align import align_cameras, pose_errors, same_frame
 from relit.evaluate.definitions import DEFINITIONS, ROUNDTRIP_SIDE, ROUNDTRIP_SPP, ROUNDTRIP_VIEWS, SURFACE_SAMPLES
-from relit.scene import Asset, Camera, Mesh
+from relit.scene import Asset, Camera, Flash, Mesh
 
 
 @dataclass(frozen=True)
@@ -183,14 +183,17 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
 def aligned(asset: Asset, truth: dict[str, Camera], recovered: dict[str, Camera]) -> tuple[Asset, str]:
     """The asset carried into the frame of the true cameras, and how: 'identity' when its cameras stand there already (they were given) or
     it has none, 'sim3' when they were recovered from photos and the frame is free."""
-    from relit.conventions import move_pose
+    from relit.conventions import move_pose, scale_of
 
     if not recovered or same_frame(recovered, truth):
         return asset, "identity"
     s = align_cameras(recovered, truth)
+    k = scale_of(s)
+    flash = None if asset.flash is None else Flash(asset.flash.offset * k, asset.flash.intensity * k**2)
     environment = None if asset.environment is None else rotate_environment(asset.environment, s)
     cameras = tuple((name, camera.with_pose(move_pose(s, camera.world_from_camera))) for name, camera in asset.cameras)
-    return replace(asset, world_from_asset=s @ asset.world_from_asset, environment=environment, cameras=cameras), "sim3"
+    placed = s @ asset.world_from_asset
+    return replace(asset, world_from_asset=placed, environment=environment, cameras=cameras, flash=flash), "sim3"
 
 
 def _cameras_of(asset: Asset):

@@ -94,8 +94,8 @@ def find_all(shots: list[Shot], groups: list[Group], degrees: float, run, option
     crops, hints = crops_of(shots), np.array([s.direction for s in shots])
     schedule, without = schedule_of(options.rounds), options.without
     try:
-        begun = None if "search" in without else poses_from_links(crops, groups, shots, hints, degrees, options.keep, seed, run.say)
-        args = (crops, hints, degrees, schedule, options.keep, options.starts, without, seed, run.say, options.polish, begun)
+        begun = None if "search" in without else poses_from_links(crops, groups, shots, hints, degrees, options.hypotheses, seed, run.say)
+        args = (crops, hints, degrees, schedule, options.hypotheses, options.starts, without, seed, run.say, options.polish, begun)
         poses, scores = find_poses(*args, soft=options.lambda_c if options.assignment == "soft" else None)
     except ValueError as error:
         why = f"{error}: the masks belong to different objects, or are wrong"

@@ -170,7 +170,6 @@ def find_poses(
     without: names of `collection.WITHOUT`. linked: (poses, scores, held) of `collection_links.poses_from_links`, which then come first.
     soft: see `poses_from_hints`."""
     hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
-    keep = 1 if "multiplex" in without else keep
     if "search" in without:
         front = np.array([0.0, 0.0, 1.0])
         poses = [pose_towards(c, d if d.any() else front) for c, d in zip(crops, directions, strict=True)]

@@ -80,10 +80,10 @@ def find(shots: list[Shot], model: VolumeModel, degrees: float, options: Collect
     hinted = np.linalg.norm(hints, axis=1) > 0.5
     prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * hinted[:, None, None]
     allowed = near(gallery, hints, degrees + SLACK) | ~hinted[:, None]
-    found = search(crops, gallery, options.keep, rings=rings, prior=prior, allowed=allowed)
+    found = search(crops, gallery, options.hypotheses, rings=rings, prior=prior, allowed=allowed)
     cut = np.flatnonzero([is_cut(c) for c in crops])
     if slid and len(cut):
-        more = slide([crops[i] for i in cut], render, gallery.cameras, options.keep, allowed[cut], prior[cut].max(2))
+        more = slide([crops[i] for i in cut], render, gallery.cameras, options.hypotheses, allowed[cut], prior[cut].max(2))
         found.poses[cut], found.scores[cut] = more.poses, more.scores
     return crops, rings, render, found
 
@@ -91,7 +91,7 @@ def find(shots: list[Shot], model: VolumeModel, degrees: float, options: Collect
 def register(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int) -> list[Camera]:
     """The cameras of photos that the model has not seen, by search and local refinement."""
     crops, rings, render, found = find(shots, model, degrees, options, seed, slid=True)
-    poses, _ = best_refined(crops, found, render, rings, options.keep)
+    poses, _ = best_refined(crops, found, render, rings, options.hypotheses)
     return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)]
 
 

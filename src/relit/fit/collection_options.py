@@ -51,6 +51,11 @@ class CollectionOptions:
     without: tuple[str, ...] = ()
 
     @property
+    def hypotheses(self) -> int:
+        """How many of each photo are refined wherever photos are searched for."""
+        return 1 if "multiplex" in self.without else self.keep
+
+    @property
     def max_pixels(self) -> int:
         """Of all photos together, for the forecast of memory: each is shrunk as it is read."""
         return 150 * self.side**2

@@ -31,7 +31,18 @@ from relit.fit.instances import ANOTHER_PHOTO, View, carved, hold_distances, mov
 from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
-from relit.fit.pile_scene import distance_in, find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
+from relit.fit.pile_scene import (
+    alone_bank,
+    distance_in,
+    find_ground,
+    ground_colour,
+    ground_reflectance,
+    light_below,
+    photo_bank,
+    scene_mesh,
+    set_down,
+    spread,
+)
 from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
@@ -60,6 +71,8 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     shots = [(with_normals(p.load(), options), p.camera.with_pose(np.eye(4))) for p in photos]
     if len(photos) > 1 and all(len(np.unique(pixels.labels[pixels.labels > 0])) == 1 for pixels, _ in shots):
         run.say(f"note: one object in {len(photos)} photos: it is placed by search; from all around --capture multiview is more exact")
+    if "normals" in options.without and not options.normal_network and all(pixels.normal is None for pixels, _ in shots):
+        run.say("note: without=normals changes nothing: no photo has normal priors")
     poses, registered, keys, unsure = poses_stage(shots, run, options, seed)
     chosen = [k for k in range(len(keys)) if registered[k]]
     views = [v for v in all_views(shots, options.side, options) if v.key in {keys[k] for k in chosen}]
@@ -99,7 +112,8 @@ def with_normals(pixels: Pixels, options: DuplicatesOptions) -> Pixels:
 def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> dict[str, np.ndarray]:
     """Volume pass, mesh, ground. Returns (and keeps) vertices, faces, normals, uvs, base (V, 3), plane (point, normal) or empty; for each
     instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view); motions (P, 4, 4)
-    first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos."""
+    first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances (N,) which of the
+    instances it is."""
     bank = pixel_bank(views, poses)
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
         inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
@@ -159,6 +173,7 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
             "poses": poses,
             "keys": np.array([views[some[0]].key for some in shown]),
             "view_keys": np.array([v.key for v, n in zip(views, scene.of_view, strict=True) if n >= 0]),
+            "view_instances": scene.of_view[scene.of_view >= 0],
             "motions": np.array([motion_or_none(m) for m in scene.motions]),
             "related": np.array([m is not None for m in scene.motions]),
             "plane": plane,
@@ -211,15 +226,19 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         middle = np.mean([s[:3, 3] for s in standing], 0)
         scene_from_photo = similarity(turn, -turn @ middle)
         ground_level = ground_colour(pixels, camera, parts["plane"])
-        whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, alone="visibility" in options.without)
-        used = [(number, *shots[number]) for number in np.flatnonzero(parts["related"])]
+        moves = spread(standing, scene_from_photo) if "visibility" in options.without else None
+        whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, moves)
+        numbers = np.flatnonzero(parts["related"])
+        used, cameras = [shots[n][0] for n in numbers], [shots[n][1].with_pose(scene_from_photo @ parts["motions"][n]) for n in numbers]
         keys = parts["view_keys"]
-        bank = photo_bank(
-            [pixels for _, pixels, _ in used],
-            [own.with_pose(scene_from_photo @ parts["motions"][number]) for number, _, own in used],
-            [set((keys[keys // ANOTHER_PHOTO == number] % ANOTHER_PHOTO).tolist()) for number, _, _ in used],
-            options.max_pixels,
-        )
+        shown = [keys // ANOTHER_PHOTO == n for n in numbers]
+        labels = [(keys[own] % ANOTHER_PHOTO).tolist() for own in shown]
+        if moves is None:
+            bank = photo_bank(used, cameras, [set(some) for some in labels], options.max_pixels)
+        else:
+            instances = [parts["view_instances"][own].tolist() for own in shown]
+            placed = [dict(zip(some, of, strict=True)) for some, of in zip(labels, instances, strict=True)]
+            bank = alone_bank(used, cameras, placed, moves, options.max_pixels)
         face, bary = rasterise_atlas(mesh, o.texture)
         known = face >= 0
         start = fill_gutters(interpolate(parts["base"], mesh.faces, face, bary), known)

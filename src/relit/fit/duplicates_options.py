@@ -55,7 +55,7 @@ WITHOUT = {
     "rotation_sweep": "pictures are matched as they are, not turned against each other",
     "matching": "no features are matched",
     "guided": "matches are not sought again once poses are known",
-    "search": "what matching does not link is dropped",
+    "search": "what matching does not link is dropped, and of several sets that it links all but the largest",
     "refinement": "poses stay as search has found them",
     "visibility": "no instance, and no ground, shadows another",
     "normals": "normal priors are not used",

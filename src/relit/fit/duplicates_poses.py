@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
@@ -55,9 +57,8 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
                 code=EXIT_FAILED,
             ) from None
         registered = scores >= np.median(scores) - AGREES
-        linked = {i for link in (matched.told if matched else ()) for i in link[:2]}
         if "search" in options.without and len(views) > 1:
-            registered &= np.array([k in linked for k in range(len(views))])
+            registered &= linked_together(len(views), matched.told if matched else ())
         if registered.sum() < min(2, len(views)):
             raise UserError("hardly any instance could be placed", "see the scores in the log", "check the label image", code=EXIT_FAILED)
         for k in np.flatnonzero(~registered):
@@ -73,6 +74,16 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
         keys = np.array([v.key for v in views])
         stage.save("poses", poses=poses, registered=registered, labels=keys, scores=scores, unsure=unsure)
     return poses, registered, keys, unsure
+
+
+def linked_together(count: int, told: tuple) -> np.ndarray:
+    """(count,) bool: the largest set of instances that links of pairs, (i, j, ...), hold together; none where there are no links. How two
+    sets lie to each other is for the search to find."""
+    if not told:
+        return np.zeros(count, bool)
+    i, j = np.array([link[:2] for link in told]).T
+    _, member = connected_components(coo_matrix((np.ones(len(i)), (i, j)), (count, count)), directed=False)
+    return member == np.bincount(member).argmax()
 
 
 def say_ambiguous(views: list[View], unsure: np.ndarray, registered: int, run) -> None:

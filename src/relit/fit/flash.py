@@ -246,7 +246,8 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
             values = without(values, open_hollows(bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed))
         model = start(values, False)
         mirrors = options.directions > 0 and "interreflection" not in options.without
-        begin_level = (lambda m: look_around(bank, cameras, m, coat)) if mirrors else None
+        shadow = "shadow" not in options.without
+        begin_level = (lambda m: look_around(bank, cameras, m, coat, shadow)) if mirrors else None
         fit_volume(bank, model, VolumeOptions(options.levels, options.level_steps, options.rays), stage, seed, begin_level)
         model.appearance.around = None  # it holds the training photos; the score of others goes without
         offset = np.array(model.reflections)[:3]
@@ -262,10 +263,10 @@ def rates_by_step(rates, free: float) -> Callable:
     return lambda i: rates if i >= free else held
 
 
-def look_around(bank: PixelBank, cameras: list[Camera], model: VolumeModel, coat: Coat) -> None:
-    """Tell the model's appearance what light its surface, as it is now, throws on itself."""
+def look_around(bank: PixelBank, cameras: list[Camera], model: VolumeModel, coat: Coat, shadow: bool = True) -> None:
+    """Tell the model's appearance what light its surface, as it is now, throws on itself. shadow: whether the flash throws any."""
     values = dense_values(model.grid)
-    flash = FlashView(np.array(model.reflections)[:3], float(model.appearance.intensity[0]))
+    flash = FlashView(np.array(model.reflections)[:3], float(model.appearance.intensity[0]), shadow)
     ambient = find_ambient(bank, cameras, extract_mesh(values, faces=COARSE_FACES), coat, flash, BRIGHTEST)
     model.appearance.around = ambient.around(values, coat)
 
@@ -303,7 +304,7 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, satur
         known = face >= 0
         spread = lambda v: fill_gutters(interpolate(v, mesh.faces, face, bary), known)  # noqa: E731
         traceable = TraceableMesh(mesh, np.zeros_like(mesh.vertices))
-        flash = FlashView(parts["offset"], float(parts["intensity"]))
+        flash = FlashView(parts["offset"], float(parts["intensity"]), o.shadow)
         texels = {
             "x": interpolate(mesh.vertices, mesh.faces, face, bary)[known],
             "n": interpolate(mesh.normals, mesh.faces, face, bary)[known],

@@ -30,10 +30,11 @@ ALPHA = 0.2  # of the coat that the diffuse light passes
 
 @dataclass(frozen=True)
 class FlashView:
-    """offset: (3,) unit frame, OpenCV camera axes. intensity: radiant."""
+    """offset: (3,) unit frame, OpenCV camera axes. intensity: radiant. shadow: whether it throws any."""
 
     offset: np.ndarray
     intensity: float
+    shadow: bool = True
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def seen_from(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh, x
     if not lit_only:
         ok &= (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (cos_v > 0)
     start = mi.Point3f(x + n * (2 * OFFSET))
-    for end in (light,) if lit_only else (eye, light):
+    for end in (*(() if lit_only else (eye,)), *((light,) if flash.shadow else ())):
         to = end - mi.Vector3f(start)
         length = dr.norm(to)
         ok &= ~mesh.scene.ray_test(mi.Ray3f(start, to / length, length, 0.0, []), coherent=False, active=ok)

@@ -206,7 +206,7 @@ def bounced(mesh, field, model, points, plastic, n, position, intensity, rng, o:
     """Mean of `directions` estimates of the inter-reflected light."""
     total = mi.Color3f(0)
     for _ in range(o.directions):
-        total += indirect(mesh, field, model.coat, points, plastic, n, position, intensity, rng, o.bounces)
+        total += indirect(mesh, field, model.coat, points, plastic, n, position, intensity, rng, o.bounces, o.shadow)
     return total / o.directions
 
 

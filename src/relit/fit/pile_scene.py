@@ -6,12 +6,13 @@ The scene frame has the world's axes, the object's unit of length, and its origi
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates, minimum_filter
 
-from relit.conventions import environment_directions, environment_solid_angles, move_points
+from relit.conventions import environment_directions, environment_solid_angles, move_points, similarity
 from relit.fit.pixels import make_bank
 from relit.rendering.pile import ground_square
 from relit.scene import Camera, Ground, Mesh
@@ -24,6 +25,7 @@ ONTO = 0.35  # of that way that it goes: its size tells its distance to .035 rad
 TILT = 5.0  # degrees that the ground may turn meanwhile
 STEEP = 0.3  # sine of the angle at which the photo must look down on the ground for objects to be moved onto something
 GROUND_ROWS = 96
+ROOM = 40.0  # unit lengths between instances that are to stand alone: one fills a ten-thousandth of what its neighbour sees
 
 Distance = Callable[[np.ndarray], np.ndarray]  # of points (..., 3) in the object's frame from its surface, negative inside
 
@@ -123,19 +125,46 @@ def distance_in(values: np.ndarray) -> Distance:
     return distance
 
 
-def scene_mesh(mesh: Mesh, parts, standing, scene_from_photo, pixels, camera: Camera, *, alone: bool) -> tuple[Mesh, np.ndarray]:
+def spread(standing: list[np.ndarray], scene_from_photo: np.ndarray) -> np.ndarray:
+    """(N, 3) moves, scene frame, that carry instances standing at (4, 4) photo_from_object so far apart that none shadows another."""
+    side = int(np.ceil(np.sqrt(len(standing))))
+    k = np.arange(len(standing))
+    places = ROOM * (np.stack([k % side, np.zeros(len(k)), k // side], 1) - 0.5 * (side - 1) * np.array([1, 0, 1]))
+    return places - np.array([(scene_from_photo @ pose)[:3, 3] for pose in standing])
+
+
+def alone_bank(photos: list, cameras: list[Camera], shown: list[dict[int, int]], moves: np.ndarray, max_pixels: int):
+    """As `photo_bank` for instances that were moved apart: a view of each, from a camera that was moved with it. shown: for each photo
+    label -> number of the instance."""
+    cut, own, labels = [], [], []
+    for pixels, camera, instances in zip(photos, cameras, shown, strict=True):
+        for label, number in instances.items():
+            rows, columns = (np.flatnonzero((pixels.labels == label).any(axis)) for axis in (1, 0))
+            top, left = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
+            part = (slice(top, rows[-1] + 2), slice(left, columns[-1] + 2))
+            inside = replace(pixels, rgb=pixels.rgb[part], mask=None, normal=None, clipped=None, labels=pixels.labels[part])
+            h, w = inside.labels.shape
+            pose = similarity(np.eye(3), moves[number]) @ camera.world_from_camera
+            cut.append(inside)
+            own.append(replace(camera, width=w, height=h, cx=camera.cx - left, cy=camera.cy - top, world_from_camera=pose))
+            labels.append({label})
+    return photo_bank(cut, own, labels, max_pixels)
+
+
+def scene_mesh(mesh: Mesh, parts, standing, scene_from_photo, pixels, camera: Camera, moves=None) -> tuple[Mesh, np.ndarray]:
     """All instances and the ground as one mesh in the scene frame, and the radiance (V, 3) of its vertices. Faces with negative texture
-    coordinates only block (the ground). alone: spread the instances so far apart that none shadows another, no ground."""
+    coordinates only block (the ground). moves: (N, 3) of `spread`, where no instance, and no ground, is to shadow another; or None."""
     vertices, normals, faces, uvs, radiance, count = [], [], [], [], [], 0
     for k, pose in enumerate(standing):
         m = scene_from_photo @ pose
+        m = m if moves is None else similarity(np.eye(3), moves[k]) @ m
         vertices.append(move_points(m, mesh.vertices))
         normals.append(mesh.normals @ m[:3, :3].T)
         faces.append(mesh.faces.astype(np.int64) + count)
         uvs.append(mesh.uvs)
-        radiance.append(parts["radiance"][k] * (0.0 if alone else 1.0))
+        radiance.append(parts["radiance"][k])
         count += len(mesh.vertices)
-    if len(parts["plane"]) and not alone:
+    if len(parts["plane"]) and moves is None:
         point, normal = move_points(scene_from_photo, parts["plane"][0]), scene_from_photo[:3, :3] @ parts["plane"][1]
         reach = 4 * max(np.linalg.norm(v - point, axis=1).max() for v in vertices)
         v, f = ground_square(Ground(point, normal, reach, np.ones(3)), GROUND_ROWS)

@@ -12,6 +12,7 @@ Only arrays are read: a pickle, which could run what it likes, never is.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -143,18 +144,24 @@ def load_neural_pil(path: str | Path) -> NeuralPil:
 
 
 def _arrays(file: Path) -> tuple[np.ndarray, ...]:
-    """The arrays of an .npz in the order of their names. Raises UserError where it cannot be read as plain numbers."""
+    """The arrays of an .npz in the order of the numbers in their names (numpy's own, arr_0 to arr_19, are not padded). Raises UserError
+    where it cannot be read as plain numbers."""
     try:
         with np.load(file, allow_pickle=False) as data:
             if not hasattr(data, "files"):
                 raise ValueError("a single array")
-            arrays = [np.asarray(data[n]) for n in sorted(data.files)]
+            arrays = [np.asarray(data[n]) for n in sorted(data.files, key=_with_numbers)]
     except (ValueError, OSError, EOFError, KeyError) as error:
         fix = f"give an .npz of plain arrays (a pickled one is never read): {file}"
         raise UserError("the light network could not be read", str(error)[:200], fix) from error
     if not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in arrays):
         raise UserError("the light network holds something other than finite numbers", fix=f"fetch it again: {file}")
     return tuple(a.astype(np.float32) for a in arrays)
+
+
+def _with_numbers(name: str) -> list:
+    """What sorts names by the numbers in them: text and numbers in turn."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", name)]
 
 
 def _directions() -> np.ndarray:

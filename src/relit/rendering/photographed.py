@@ -45,9 +45,10 @@ def as_photographed(asset: Asset) -> Shower:
     return show
 
 
-def lit_scene(asset: Asset, ground: bool = True) -> Scene:
-    """The object, or of duplicates all registered instances, under the asset's environment. ground: with the ground that they lie on."""
-    poses = [i.world_from_object for i in asset.instances if i.registered]
+def lit_scene(asset: Asset, ground: bool = True, whole: bool = True) -> Scene:
+    """The object, or of duplicates all registered instances, under the asset's environment. ground: with the ground that they lie on.
+    whole: False for the object alone."""
+    poses = [i.world_from_object for i in asset.instances if i.registered and whole]
     if not poses:
         return build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground if ground else None)

@@ -37,10 +37,23 @@ def direct(points: Points, plastic, coat: Coat, n, position, intensity, seen):
     return evaluate(plastic, coat, n, points.v, l) * (inverse * intensity * seen)
 
 
-def indirect(mesh: TraceableMesh, field: PlasticField, coat: Coat, points: Points, plastic, n, position, intensity, rng, bounces: int = 1):
+def indirect(
+    mesh: TraceableMesh,
+    field: PlasticField,
+    coat: Coat,
+    points: Points,
+    plastic,
+    n,
+    position,
+    intensity,
+    rng,
+    bounces: int = 1,
+    shadow: bool = True,
+):
     """Eq. (6) with one direction per point: Color3f, an unbiased estimate of light over one to `bounces` inter-reflections.
 
-    Differentiable in the plastic and the normal at the points; what arrives there is a constant. rng: PCG32 with one lane a point.
+    Differentiable in the plastic and the normal at the points; what arrives there is a constant. rng: PCG32 with one lane a point. shadow:
+    False lights what is hit as if nothing stood before it.
     """
     with dr.suspend_grad():
         flash = dr.detach(mi.Vector3f(position))
@@ -56,7 +69,8 @@ def indirect(mesh: TraceableMesh, field: PlasticField, coat: Coat, points: Point
             more = more & hit.valid
             m, slope = plastic_at(field, hit.uv, more)
             bent = bent_normal(hit, slope)
-            value = direct(hit, m, coat, bent, flash, dr.detach(intensity), lit(mesh, hit, flash, more))
+            seen = lit(mesh, hit, flash, more) if shadow else dr.select(more, mi.Float(1), 0)
+            value = direct(hit, m, coat, bent, flash, dr.detach(intensity), seen)
             arriving += dr.select(more, throughput * value, 0)
             if bounce + 1 < bounces:
                 l = sample(m, bent, hit.v, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
