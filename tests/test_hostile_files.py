@@ -31,7 +31,7 @@ from relit.files import load_arrays
 from relit.images import read_header, read_image, read_small, write_linear
 from relit.lighting.spherical_gaussians import read_json as read_gaussians
 from relit.masks.files import read_mask
-from relit.scene import Asset, Camera
+from relit.scene import Asset, Camera, Flash, Ground, Instance
 
 FUZZ = settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 
@@ -358,12 +358,16 @@ def test_asset_json_of_every_kind(tmp_path):
     from relit.asset.asset import load_asset
 
     mesh, material = pawn(6, 8, 8)
-    camera = Camera(8, 8, 10, 10, 4, 4, np.eye(4))
-    save_asset(tmp_path / "asset", Asset(mesh, material, np.eye(4), np.ones((4, 8, 3), np.float32), (("a.png", camera),)))
-    good = {name: json.loads((tmp_path / "asset" / name).read_text()) for name in ("asset.json", "cameras.json")}
+    cameras = (("a.png", Camera(8, 8, 10, 10, 4, 4, np.eye(4))),)
+    more = {"instances": (Instance(1, np.eye(4)), Instance(2, None, "hidden")), "flash": Flash(np.zeros(3), np.ones(3))}
+    ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 4.0, np.full(3, 0.5))
+    save_asset(tmp_path / "asset", Asset(mesh, material, np.eye(4), np.ones((4, 8, 3), np.float32), cameras, ground=ground, **more))
+    names = ("asset.json", "cameras.json", "instances.json", "lights/flash.json")
+    good = {name: json.loads((tmp_path / "asset" / name).read_text()) for name in names}
+    assert len(load_asset(tmp_path).instances) == 2 and load_asset(tmp_path).flash is not None
 
     @FUZZ
-    @given(st.sampled_from(sorted(good)), places, st.sampled_from(SENSELESS))
+    @given(st.sampled_from(sorted(good)), places, st.sampled_from([*SENSELESS, float("inf"), float("nan"), 10**400]))
     def run(name, where, new):
         (tmp_path / "asset" / name).write_text(json.dumps(replaced(good[name], where, new)))
         answers(load_asset, tmp_path)

@@ -157,6 +157,18 @@ def test_a_checkpoint_that_was_damaged(capsys, capture, finished, tmp_path):
         assert "cannot be read" in err and (run / "asset/object.glb").is_file()
 
 
+def test_what_a_finished_stage_has_kept_was_damaged(capsys, capture, finished, tmp_path):
+    """Later stages were made from it: it cannot be made again behind their backs."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    shutil.rmtree(run / "asset")
+    path = run / "stages/mesh/mesh.npz"
+    path.write_bytes(path.read_bytes()[:-40])
+    code, _, err = relit(capsys, "reconstruct", capture, "-o", run, *WORDS)
+    answered(code, err, 3, "stage 'mesh'")
+    assert "--overwrite" in err
+
+
 def test_a_disk_that_fills_up(capsys, capture, tmp_path):
     """A limit on the size of files stands for a full disk: the same OSError from the same calls."""
     run = tmp_path / "run"

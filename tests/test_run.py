@@ -139,6 +139,13 @@ def test_a_replaced_photo_is_noticed(tmp_path):
         Run.open(tmp_path / "run", CONFIG, inputs=digests(photos, ["a", "b"]))
 
 
+def test_a_damaged_list_of_inputs_is_an_answer(tmp_path):
+    Run.open(tmp_path / "run", CONFIG, inputs={"a": "1:x"}).close()
+    (tmp_path / "run/inputs.json").write_text('{"a": ')
+    with pytest.raises(UserError, match=r"inputs\.json cannot be read"):
+        Run.open(tmp_path / "run", CONFIG, inputs={"a": "1:x"})
+
+
 def test_stage_records_time_memory_and_losses(tmp_path):
     calls = []
     with Run.open(tmp_path, CONFIG) as run:

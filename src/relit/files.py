@@ -117,7 +117,7 @@ def read_json(path: Path) -> dict | None:
     """A small JSON file, or None where there is none or it cannot be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 

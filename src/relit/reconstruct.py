@@ -120,15 +120,20 @@ def with_cameras(capture: Capture, run: Run, job: Job) -> Capture:
     """The capture with cameras: its own, or found from the photos (stage 'cameras', kept for a resume)."""
     if capture.has_cameras:
         return capture
-    from relit.cameras.sfm import find_cameras
+    from relit.cameras.sfm import find_cameras, kept_cameras
     from relit.capture import with_grabcut
 
     focal = _decoded_focal(capture, job.focal)
 
     # the finder keeps its own model in the stage's folder, so a second call after a stop is cheap
     if run.done("cameras"):
-        found, _ = find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=focal)
-        return with_grabcut(found) if job.masks == "grabcut" else found
+        folder = run.folder / "stages" / "cameras"
+        kept = kept_cameras(capture, seed=job.seed, workdir=folder, focal=focal)
+        if kept is None:  # found anew they would stand in a frame of their own, and what later stages have kept would not fit
+            why = "the model was damaged or removed; later stages were computed from it"
+            fix = f"give the same command with --overwrite to begin anew: {folder}"
+            raise UserError("the cameras that this run has found cannot be read", why, fix)
+        return with_grabcut(kept[0]) if job.masks == "grabcut" else kept[0]
     with run.stage("cameras", title="cameras from photos") as stage:
         found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=focal, say=run.say)
     run.say(str(verdict))

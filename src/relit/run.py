@@ -328,6 +328,9 @@ def _compare(folder: Path, wanted: dict, inputs: dict[str, str] | None) -> None:
             code=EXIT_USAGE,
         )
     before = read_json(folder / "inputs.json")
+    if before is None and (folder / "inputs.json").exists():
+        fix = f"use another -o, or --overwrite to begin anew: {folder / 'inputs.json'}"
+        raise UserError("the run's inputs.json cannot be read", "whether the photos are still the same is not known", fix)
     if inputs is not None and before is not None and before != inputs:
         changed = [k for k in dict.fromkeys([*before, *inputs]) if before.get(k) != inputs.get(k)]
         listed = ", ".join(changed[:5]) + (" ..." if len(changed) > 5 else "")

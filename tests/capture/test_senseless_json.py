@@ -15,7 +15,7 @@ from relit.conventions import world_from_gl_camera
 from relit.errors import UserError
 
 SIDE = 64
-JUNK = [None, True, -1, 0, 1e308, -1e-308, float("nan"), float("inf"), 10**30, "", "x", "../../etc/passwd", "\x00"]
+JUNK = [None, True, -1, 0, 1e308, -1e-308, float("nan"), float("inf"), 10**30, 10**400, "", "x", "../../etc/passwd", "\x00"]
 JUNK += [[], {}, [[]], [1, 2], {"a": 1}, [None] * 3]
 
 

@@ -148,6 +148,9 @@ def test_an_unfinished_or_missing_truth_is_a_user_error(tmp_path):
     with pytest.raises(UserError) as error:
         protocols.load_truth(tmp_path)
     assert "unfinished" in error.value.why
+    (tmp_path / "truth" / "truth.json").write_text('{"settings": {')
+    with pytest.raises(UserError, match="cannot be read"):
+        protocols.load_truth(tmp_path)
 
 
 def test_the_table_shows_every_figure(truth, itself):

@@ -73,7 +73,7 @@ def cameras_from_json(data: dict, where: str | Path = "") -> tuple[tuple[str, Ca
                 k.pop()
             k += [0.0] * (max(0, 4 - len(k)) if k else 0)
             out.append((str(f.get("file_path", f"{i:04d}")), Camera(width, height, *numbers, world_from_cv_camera(pose), tuple(k))))
-    except (KeyError, TypeError, ValueError) as e:
+    except (KeyError, TypeError, ValueError, OverflowError) as e:
         raise UserError("the camera file cannot be used", f"{type(e).__name__}: {e}", f"check it: {where}") from None
     return tuple(out)
 
@@ -201,7 +201,7 @@ def load_asset(folder_or_run: str | Path) -> Asset:
         singular = not np.isfinite(world_from_asset).all() or abs(np.linalg.det(world_from_asset)) < 1e-30
         if world_from_asset.shape != (4, 4) or singular:
             raise ValueError("not a regular 4 x 4 matrix")
-    except (KeyError, TypeError, ValueError) as e:
+    except (KeyError, TypeError, ValueError, OverflowError) as e:
         why = f"{type(e).__name__}: {e}"
         raise UserError("world_from_asset in asset.json cannot be used", why, f"reconstruct again: {folder}") from None
     mesh, material = read_asset_file(folder / "object.glb")

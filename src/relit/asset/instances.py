@@ -71,6 +71,6 @@ def read_instances(folder: Path) -> tuple[tuple[Instance, ...], Ground | None]:
             g = data["ground"]
             point, normal, colour = (np.array(g[k], np.float64).reshape(3) for k in ("point", "normal", "colour"))
             ground = Ground(point, normal / np.linalg.norm(normal), float(g["radius"]), colour, float(g.get("roughness", 0.8)))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as e:
         raise UserError("instances.json cannot be used", f"{type(e).__name__}: {e}", f"reconstruct again: {folder}") from None
     return tuple(instances), ground

@@ -94,10 +94,10 @@ def find_cameras(
     if len(photos) < 3:
         raise UserError(f"{len(photos)} photos are not enough to find cameras", "at least 3 that overlap are needed", "add photos")
     workdir = Path(workdir)
-    key = [seed, focal, *([p.name, p.width, p.height, p.focal_hint] for p in photos)]
-    kept = _kept(workdir, key)
+    key = _key(capture, seed, focal)
+    kept = kept_cameras(capture, seed=seed, workdir=workdir, focal=focal)
     if kept is not None:
-        return _registered(capture, *kept), kept[-1]
+        return kept
     for name in ("images", "masks", "tries", "model"):
         shutil.rmtree(workdir / name, ignore_errors=True)
         (workdir / name).mkdir(parents=True)
@@ -132,6 +132,16 @@ def find_cameras(
     result = _registered(capture, best.model, sphere, source, verdict)  # may raise: then nothing is kept
     _keep(workdir, key, best.model, sphere, source, verdict)
     return result, verdict
+
+
+def kept_cameras(capture: Capture, *, seed: int = 0, workdir: Path, focal: float | None = None) -> tuple[Capture, Verdict] | None:
+    """What an earlier `find_cameras` with the same arguments found, or None where nothing is kept or it cannot be read."""
+    kept = _kept(Path(workdir), _key(capture, seed, focal))
+    return None if kept is None else (_registered(capture, *kept), kept[-1])
+
+
+def _key(capture: Capture, seed: int, focal: float | None) -> list:
+    return [seed, focal, *([p.name, p.width, p.height, p.focal_hint] for p in capture.photos)]
 
 
 def _plan(photos: list[Photo], capture: Capture, has_masks: bool, focal: float | None) -> list[Settings]:

@@ -112,7 +112,7 @@ def corrected_sphere(root: Path) -> Sphere | None:
         centre, radius = np.array(data["centre"], np.float64), float(data["radius"])
         if centre.shape != (3,) or not np.isfinite(centre).all() or not 0 < radius < np.inf:
             raise ValueError
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, OverflowError):
         raise UserError("the corrected object sphere cannot be read", fix=f"correct it again, or remove the file: {path}") from None
     return Sphere(centre, radius)
 

@@ -89,7 +89,7 @@ def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
             if mask is None or mask.shape != shape:
                 raise UserError(f"no usable mask {name}", "each instance needs its mask at the photo's size", f"see: {source.parent}")
             labels[mask > 127] = k + 1
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError("scene_gt.json is not as BOP writes it", f"{type(error).__name__}: {error}", f"see: {source}") from None
     return labels
 

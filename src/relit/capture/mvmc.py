@@ -66,7 +66,7 @@ def directions_of(found: Path) -> dict[str, np.ndarray]:
             eye = -(r @ t)
             ok = r.shape == (3, 3) and t.shape == (3,) and np.isfinite(eye).all() and np.abs(r @ r.T - np.eye(3)).max() < 0.05
             ok = ok and np.linalg.norm(eye) > 1e-6
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             ok = False
         if not ok:
             what = f"camera_initial of '{entry['filename']}' is no camera"

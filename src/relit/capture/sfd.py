@@ -216,7 +216,7 @@ def _camera(file: Path, photo: Path, width: int, height: int) -> tuple[np.ndarra
             return None
         try:
             out = float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             out = -1.0
         if not 0 < out < 1e6:
             raise UserError(f"'{key}' is no focal length, size or principal point: {value!r}", fix=f"write a number of pixels: {file}")
@@ -238,7 +238,7 @@ def _bop_camera(file: Path, photo: Path, width: int, height: int) -> tuple[np.nd
         k = np.array(read_json(file)[str(int(photo.stem))]["cam_K"], np.float64).reshape(3, 3)
         if not (np.isfinite(k).all() and k[0, 0] > 0):
             raise ValueError("cam_K makes no sense")
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError("scene_camera.json is not as BOP writes it", f"{type(error).__name__}: {error}", f"see: {file}") from None
     # BOP counts pixel centres as whole numbers
     return np.eye(4), float((k[0, 0] + k[1, 1]) / 2), (float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)

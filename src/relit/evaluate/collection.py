@@ -7,7 +7,6 @@ by the package's path tracer.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,13 +40,13 @@ DEFINITIONS = {
 
 def load_collection_truth(folder: str | Path) -> Truth:
     """The truth of a synthetic collection as `protocols.Truth`. Raises UserError where it is not complete."""
-    from relit.asset.asset import read_cameras
+    from relit.asset.asset import read_cameras, read_json
 
     folder = Path(folder)
     file = folder / "truth" / "truth.json"
     if not file.is_file():
         raise UserError("the folder holds no complete truth", fix=f"make one with `relit synthesize collection`: {folder}")
-    meta = json.loads(file.read_text())
+    meta = read_json(file)
     cameras = {camera_key(name): camera for name, camera in read_cameras(folder / "truth" / "cameras.json")}
     train, test = ({n: cameras[n] for n in meta[split]} for split in ("train", "test"))
     return Truth(folder, train, test, float(meta["sphere"]["radius"]), meta)

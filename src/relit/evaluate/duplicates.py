@@ -7,7 +7,6 @@ the choice of the object's own frame. The frame is the one that agrees best with
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -71,7 +70,7 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
 
 def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
     """Every figure that the truth allows, as `evaluate.protocols.evaluate`. Raises UserError where the truth is unfinished."""
-    from relit.asset.asset import load_asset
+    from relit.asset.asset import load_asset, read_json
     from relit.images import read_data
     from relit.rendering.mitsuba_scene import build_scene, render, render_channels
     from relit.rendering.pile import build_pile
@@ -79,7 +78,7 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     folder, asset = Path(truth_folder), load_asset(run)
     if not (folder / "truth" / "truth.json").is_file():
         raise UserError("the folder holds no complete truth", "its rendering was stopped", f"make it again: {folder}")
-    truth = json.loads((folder / "truth" / "truth.json").read_text())
+    truth = read_json(folder / "truth" / "truth.json")
     cameras = read_cameras(folder / "transforms_test.json")
     photo = read_cameras(folder / "transforms_train.json")[0][1]
     true_poses = {i["label"]: np.array(i["world_from_object"]) for i in truth["instances"]}
@@ -178,6 +177,7 @@ def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 64, se
 def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
     """SfD's own poses world_from_object (4, 4) by label; the object of each file entry is the one at whose label its middle lies. {} where
     there are none."""
+    from relit.asset.asset import read_json
     from relit.capture.sfd import open_duplicates, recognise
 
     files = [capture / name for name in ("object_pred_pose.json", "object_scale_matrix.json")]
@@ -185,8 +185,8 @@ def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
     if source is None or not all(f.is_file() for f in files):
         return {}
     labels = open_duplicates(source, focal=camera.fx).photos[0].load().labels
-    listed = json.loads(files[0].read_text())
-    middle = np.array(json.loads(files[1].read_text())["scale_matrix"], np.float64)[:3, 3]
+    listed = read_json(files[0])
+    middle = np.array(read_json(files[1])["scale_matrix"], np.float64)[:3, 3]
     out = {}
     for name in sorted(listed):
         pose = np.array(listed[name], np.float64)
@@ -229,7 +229,9 @@ def photo_figure(asset: Asset, capture: Path, *, run: Path | None = None, spp: i
 
 def read_cameras(file: Path) -> list[tuple[str, Camera]]:
     """(name, Camera) pairs of a transforms file with one focal length."""
-    data = json.loads(file.read_text())
+    from relit.asset.asset import read_json
+
+    data = read_json(file)
     w, h, f = data["w"], data["h"], float(data["focal"])
     return [
         (Path(x["file_path"]).stem, Camera(w, h, f, f, w / 2, h / 2, world_from_cv_camera(np.array(x["transform_matrix"], np.float64))))
@@ -270,13 +272,13 @@ def pose_figures(poses: dict, true_poses: dict, visible: dict) -> dict[str, floa
 
 def poses_before(run: Path, photo: Camera, labels: list[int]) -> dict[int, np.ndarray]:
     """world_from_object of the given labels as the pose search has left them; {} for an asset without its run."""
-    from relit.files import load_arrays
+    from relit.files import NO_ARRAYS, load_arrays
 
-    file = run / "stages" / "poses" / "poses.npz"
-    if not file.is_file():
+    try:
+        saved = load_arrays(run / "stages" / "poses" / "poses.npz")
+        found = {int(k): p for k, p in zip(saved["labels"], saved["poses"], strict=True)}
+    except NO_ARRAYS:  # not there, or damaged
         return {}
-    saved = load_arrays(file)
-    found = {int(k): p for k, p in zip(saved["labels"], saved["poses"], strict=True)}
     return {k: photo.world_from_camera @ np.linalg.inv(found[k]) for k in labels if k in found}
 
 

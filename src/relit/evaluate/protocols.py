@@ -57,6 +57,8 @@ def has_truth(folder: str | Path) -> bool:
 
 def load_truth(folder: str | Path) -> Truth:
     """Read the cameras and the description of a synthetic capture. Raises UserError where there is none, or an unfinished one."""
+    from relit.asset.asset import read_json
+
     folder = Path(folder)
     folder = folder.parent if folder.name == "truth" else folder
     file = folder / "truth" / "truth.json"
@@ -67,14 +69,16 @@ def load_truth(folder: str | Path) -> Truth:
             else "there is no truth/truth.json"
         )
         raise UserError("the folder holds no complete truth", why, f"make one with `relit synthesize`, or give its folder: {folder}")
-    meta = json.loads(file.read_text())
+    meta = read_json(file)
     size = meta["settings"]["resolution"]
     train, test = (_read_cameras(folder / f"transforms_{split}.json", size) for split in ("train", "test"))
     return Truth(folder, train, test, float(meta["sphere"]["radius"]), meta)
 
 
 def _read_cameras(file: Path, size: int) -> dict[str, Camera]:
-    content = json.loads(file.read_text())
+    from relit.asset.asset import read_json
+
+    content = read_json(file)
     focal = size / (2 * np.tan(content["camera_angle_x"] / 2))
     return {
         camera_key(f["file_path"]): Camera(

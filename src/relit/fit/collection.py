@@ -82,7 +82,7 @@ def pose_stage(shots: list[Shot], groups: list[Group], degrees: float, run, opti
         with run.stage("poses", title="where the photos were taken from") as stage:
             kept = find_all(shots, groups, degrees, run, options, seed)
             stage.save("poses", **kept)
-        judge_poses(kept["scores"], float(kept["agreement"]), shots, options, run)
+    judge_poses(kept["scores"], float(kept["agreement"]), shots, options, run)  # when resumed too: what was refused stays refused
     poses, scores, linked = kept["poses"], kept["scores"], kept["linked"]
     loss = 1 - scores
     weights = np.ones(len(shots)) if "posterior" in options.without else posterior(loss, [*loss, *loss][:1000] * (20 // len(loss) + 1))

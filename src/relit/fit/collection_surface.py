@@ -102,11 +102,15 @@ def fit_collection_surface(
 ) -> CollectionSurface:
     """Run the pass; returns the same model, optimised. frozen: only lights move (held-out photos). Resumes from the stage's checkpoint."""
     material, first, views, count = model.material, 0, bank.views, options.points
+    even = mean_level(model.family)
+    begun = np.exp(model.gains) * even  # (V, 3) light of each photo as the pass begins, which the mesh's own colours go with
+    running = np.zeros(views)
     saved = stage.load("checkpoint")
     if saved:
         first = int(saved["step"])
         material.colour, material.metallic, material.slope = (mi.Float(saved[n]) for n in ("colour", "metallic", "slope"))
         model.coefficients, model.gains, model.weights = saved["coefficients"], saved["gains"], saved["weights"]
+        model.losses, running = saved.get("losses", np.zeros(0)).tolist(), saved.get("running", running)
     rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
     adam_colour, adam_metallic, adam_slope = (Adam(dr.width(p)) for p in (material.colour, material.metallic, material.slope))
     adam_slope.floor = options.slope_calm
@@ -114,10 +118,8 @@ def fit_collection_surface(
     adam_s = Adam(3)
     ratio = mi.Float(np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2))
     lights = PhotoLights(dr.exp(mi.Float(model.lights().ravel())), views)
-    even = mean_level(model.family)
-    level = mi.Float((np.exp(model.gains) * even).astype(np.float32).ravel())  # what arrives on average: for what blocks a direction
-    running = np.zeros(views)
-    exposure = mi.Float((np.exp(model.gains) * even).mean(1).astype(np.float32))
+    level = mi.Float(begun.astype(np.float32).ravel())  # what arrives on average: for what blocks a direction
+    exposure = mi.Float(begun.mean(1).astype(np.float32))
 
     broad = None if frozen or first >= light.broad * options.steps else BroadSteps(mesh.mesh, options.texture)
     window = max(5, round(light.window * options.steps))
@@ -211,7 +213,8 @@ def fit_collection_surface(
 
     def state() -> dict:
         arrays = {"colour": np.array(material.colour), "metallic": np.array(material.metallic), "slope": np.array(material.slope)}
-        return {**arrays, "coefficients": model.coefficients, "gains": model.gains, "weights": model.weights}
+        arrays |= {"coefficients": model.coefficients, "gains": model.gains, "weights": model.weights}
+        return {**arrays, "losses": np.array(model.losses), "running": running}
 
     def textures(uv, valid):
         at = material_at(material, uv, valid)

@@ -31,7 +31,8 @@ def draw_patches(bank: PixelBank, rng, count: int):
     first = dr.arange(mi.UInt32, count // SIDE**2) * SIDE**2
     corner = dr.gather(mi.UInt32, draw_pixels(bank, rng, count), first)
     view, x, y = locate(bank, corner)
-    width, offset = dr.gather(mi.UInt32, bank.widths, view), dr.gather(mi.UInt32, bank.offsets, view)
+    width = dr.maximum(dr.gather(mi.UInt32, bank.widths, view), 1)  # as in `locate`: unused lanes of a vector register
+    offset = dr.gather(mi.UInt32, bank.offsets, view)
     last = view + 1 >= bank.views
     end = dr.select(last, bank.total, dr.gather(mi.UInt32, bank.offsets, dr.minimum(view + 1, bank.views - 1)))
     height = (end - offset) // width

@@ -395,7 +395,13 @@ def rotation_from_y(up: np.ndarray) -> np.ndarray:
 
 
 def run_arrays(run, stage: str, name: str) -> dict[str, np.ndarray]:
-    """Arrays that a finished stage has kept."""
-    from relit.files import load_arrays
+    """Arrays that a finished stage has kept. Raises UserError where they cannot be read."""
+    from relit.files import NO_ARRAYS, load_arrays
 
-    return load_arrays(run.folder / "stages" / stage / f"{name}.npz")
+    path = run.folder / "stages" / stage / f"{name}.npz"
+    try:
+        return load_arrays(path)
+    except NO_ARRAYS as error:
+        what = f"what the finished stage '{stage}' has kept cannot be read ({type(error).__name__})"
+        why = "the file was damaged or removed; later stages were computed from it"
+        raise UserError(what, why, f"give the same command with --overwrite to begin anew: {path}") from None

@@ -59,7 +59,7 @@ def read_flash(path: str | Path) -> Flash:
         offset, intensity = (np.array(data[k], np.float64) for k in ("offset", "intensity"))
         if offset.shape != (3,) or intensity.shape != (3,) or not np.isfinite([offset, intensity]).all() or (intensity < 0).any():
             raise ValueError("offset and intensity must be three finite numbers each, intensity not negative")
-    except (OSError, ValueError, KeyError, TypeError) as e:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as e:
         why = f"{type(e).__name__}: {e}"
         raise UserError(
             "the flash cannot be read", why, f'it should hold {{"offset": [x, y, z], "intensity": [r, g, b]}}: {path}'
