@@ -18,7 +18,7 @@ from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels
 from relit.fit.preview import surface_preview
-from relit.fit.surface import SurfaceOptions, material_prior, neighbours, parsimony
+from relit.fit.surface import SurfaceOptions, common_scale, material_prior, neighbours, parsimony
 from relit.lighting.neural_pil import load_neural_pil
 from relit.lighting.per_photo import TEXELS, LightComponents, PhotoLights, light_prior, log_lights, mean_level
 from relit.materials.field import MaterialField, material_at, project, slope_at
@@ -162,8 +162,9 @@ def fit_collection_surface(
         loss = fit
         if not frozen:
             smoothing = dr.opaque(mi.Float, options.smooth_colour)
-            loss = loss + material_prior(material, surface, near, valid, options, smoothing)
-            loss = loss + parsimony(material, surface, points.uv, valid, shift, options)
+            scale = common_scale(surface, valid, options.scale_power)
+            loss = loss + material_prior(material, surface, near, valid, scale, options, smoothing)
+            loss = loss + parsimony(material, surface, points.uv, valid, scale, shift, options)
             loss = loss + options.slope_small * dr.mean(dr.select(valid, dr.squared_norm(slope), 0))
             if light.anchor > 0:
                 pull = dr.opaque(mi.Float, light.anchor * 0.1 ** (i / (light.lambda_a * options.steps)))
