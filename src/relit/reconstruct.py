@@ -162,7 +162,7 @@ def _save(run: Run, asset, capture: Capture, kind: str, job: Job, device: str) -
         "peak_memory": max((s["peak_memory"] for s in stages), default=0),
         "inputs": json.loads((run.folder / "inputs.json").read_text()),
     }
-    from relit.evaluate.protocols import write_own_renders
+    from relit.evaluate.roundtrip import write_own_renders
 
     with run.stage("asset", title="asset") as stage:
         write_own_renders(stage.folder, asset)  # what the file formats are judged against

@@ -15,7 +15,9 @@ import numpy as np
 from relit.conventions import sample_environment
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.align import pose_errors
+from relit.evaluate.align import aligned, pose_errors
+from relit.evaluate.results import entries
+from relit.evaluate.truth import camera_key
 from relit.files import parse_toml
 from relit.scene import Asset, Camera, Capture, Photo, Sphere
 
@@ -53,7 +55,6 @@ def evaluate_on_photos(asset: Asset, folder: Path, *, run: Path | None = None, s
 
     Returns as `protocols.evaluate`. Raises UserError when the folder is no capture, has no cameras, or shares no photo with the asset.
     """
-    from relit.evaluate.protocols import aligned, camera_key
     from relit.rendering.mitsuba_scene import build_scene
 
     if asset.environment is None:
@@ -68,12 +69,8 @@ def evaluate_on_photos(asset: Asset, folder: Path, *, run: Path | None = None, s
     scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
     per_view = {p.name: photo_figures(scene, asset, p, capture.sphere, spp, seed + i) for i, p in enumerate(photos)}
     names = [n for n in _FIGURES if any(n in v for v in per_view.values())]
-    values = {n: float(np.nanmean([v[n] for v in per_view.values() if n in v])) for n in names}
-    meaning = definitions(prefix)
-    metrics = {}
-    for name, value in values.items():
-        unit, definition = meaning[f"{prefix}_{name}"]
-        metrics[f"{prefix}_{name}"] = {"value": value, "unit": unit, "definition": definition}
+    values = {f"{prefix}_{n}": float(np.nanmean([v[n] for v in per_view.values() if n in v])) for n in names}
+    metrics = entries(values, definitions(prefix))
     metrics |= camera_figures({camera_key(name): c for name, c in asset.cameras}, given) if alignment == "sim3" else {}
     return {"metrics": metrics, "per_view": per_view, "photos": len(photos), "alignment": alignment}
 
@@ -150,4 +147,4 @@ def camera_figures(recovered: dict[str, Camera], given: dict[str, Camera]) -> di
     """How far the recovered cameras, already aligned, are from the given ones."""
     rotations, _ = pose_errors(recovered, given, np.eye(4))
     text = "median rotation error of the recovered cameras against the capture's own, after Sim(3) alignment"
-    return {"camera_rotation": {"value": float(np.median(rotations)), "unit": "degrees", "definition": text}}
+    return entries({"camera_rotation": float(np.median(rotations))}, {"camera_rotation": ("degrees", text)})
