@@ -123,27 +123,26 @@ def with_cameras(capture: Capture, run: Run, job: Job) -> Capture:
     from relit.cameras.sfm import find_cameras
     from relit.capture import with_grabcut
 
-    focal = _decoded_focal(capture, job.focal)
+    focals = _decoded_focals(capture, job.focal)
 
     # the finder keeps its own model in the stage's folder, so a second call after a stop is cheap
     if run.done("cameras"):
-        found, _ = find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focal=focal)
+        found, _ = find_cameras(capture, seed=job.seed, workdir=run.folder / "stages" / "cameras", focals=focals)
         return with_grabcut(found) if job.masks == "grabcut" else found
     with run.stage("cameras", title="cameras from photos") as stage:
-        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=focal, say=run.say)
+        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focals=focals, say=run.say)
     run.say(str(verdict))
     return with_grabcut(found) if job.masks == "grabcut" else found  # it is seeded by the object sphere, so it had to wait for the cameras
 
 
-def _decoded_focal(capture: Capture, focal: float | None) -> float | None:
-    """--focal is in pixels of the files; the finder wants it in those of the photos as decoded (--max-side shrinks them)."""
+def _decoded_focals(capture: Capture, focal: float | None) -> list[float] | None:
+    """--focal is in pixels of the files; the finder wants it in those of each photo as decoded (--max-side shrinks large ones more)."""
     if focal is None:
         return None
     from relit.images import read_header
 
-    photo = capture.photos[0]
-    header = read_header(capture.root / photo.name)
-    return focal * max(photo.width, photo.height) / max(header.width, header.height)
+    headers = [read_header(capture.root / photo.name) for photo in capture.photos]
+    return [focal * max(p.width, p.height) / max(h.width, h.height) for p, h in zip(capture.photos, headers, strict=True)]
 
 
 def _save(run: Run, asset, capture: Capture, kind: str, job: Job, device: str) -> None:
