@@ -157,10 +157,10 @@ def input_digests(capture: Capture) -> dict[str, str]:
 
 def _read_with(photo: Photo) -> Iterator[Path]:
     """The mask and the normal prior that a photo is read with, wherever they lie."""
-    load = photo.load
-    while load is not None:
-        yield from (p for p in (getattr(load, "mask", None), getattr(load, "normal", None)) if isinstance(p, Path))
-        load = getattr(load, "load", None)
+    from relit.capture.photo import layers
+
+    for layer in layers(photo.load):
+        yield from (p for p in (getattr(layer, "mask", None), getattr(layer, "normal", None)) if isinstance(p, Path))
 
 
 # ---------------------------------------------------------------- cost
