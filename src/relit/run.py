@@ -96,6 +96,10 @@ class Run:
         """One log line, on stderr and in log.txt."""
         self.log.say(text)
 
+    def progress(self, title: str) -> Callable[[int], None]:
+        """A progress line for steps besides those of a stage: call it with how many are over."""
+        return Progress(self.log, title, None).update
+
     def done(self, stage: str) -> bool:
         """Did this stage run to its end, now or in an earlier process?"""
         return read_json(self.folder / "stages" / stage / "DONE") is not None

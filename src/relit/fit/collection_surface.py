@@ -16,9 +16,9 @@ from relit.fit.broad_steps import BroadSteps
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
-from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.pixels import PixelBank, batch_of, draw_pixels, saturated_at
 from relit.fit.preview import surface_preview
-from relit.fit.surface import SurfaceOptions, common_scale, material_prior, neighbours, parsimony
+from relit.fit.surface import SurfaceOptions, common_scale, dual_values, material_prior, neighbours, parsimony
 from relit.lighting.neural_pil import load_neural_pil
 from relit.lighting.per_photo import TEXELS, LightComponents, PhotoLights, light_prior, log_lights, mean_level
 from relit.materials.field import MaterialField, material_at, project, slope_at
@@ -157,7 +157,7 @@ def fit_collection_surface(
         a, b = reflected(points, drawn, surface, of)
         heard = np.maximum(model.weights, LEAST).astype(np.float32)
         weight = dr.gather(mi.Float, mi.Float(heard), batch.view)
-        each = residuals(a, b, batch.rgb, bank.saturated)
+        each = dual_values(a, b, batch.rgb, saturated_at(bank, batch.view))
         fit = weighted_mean(each, dr.select(valid, weight, 0))
         loss = fit
         if not frozen:
@@ -235,14 +235,6 @@ def exchange_scale(adam: Adam, material: MaterialField, colour_gradient, gain_gr
     project(material)
     dr.eval(material.colour)
     return move.astype(np.float32)
-
-
-def residuals(a, b, target, saturated: float):
-    """Per point: mean over channels of display_weight (a - L*)(b - L*), unbiased for the squared error. A pixel from
-    `saturated` on only says "at least this bright"."""
-    value = (a - target) * (b - target) * display_weight(target)
-    value = dr.select((target >= saturated) & (dr.detach((a + b) * 0.5) > target), 0, value)
-    return (value.x + value.y + value.z) / 3
 
 
 def _watch(model: CollectionSurface, each, valid, view, running, i: int, steps: int) -> np.ndarray:

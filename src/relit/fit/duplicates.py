@@ -227,7 +227,7 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         level = float((parts["radiance"].mean(0) * areas[:, None]).sum() / areas.sum() / 3)
         traced, metallic, roughness = TraceableMesh(whole, radiance), PAINT, None
         if options.first_material and stage.load("checkpoint") is None:
-            metallic, roughness = first_material(bank, traced, start, known, level, None, o, seed)
+            metallic, roughness = first_material(bank, traced, start, known, level, None, o, seed, run.progress("metal or paint"))
             run.say(describe(metallic, roughness, known))
         model = start_surface(start, known, level, o, None, metallic, roughness)
         if options.gaussians:

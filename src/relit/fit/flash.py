@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 import numpy as np
 
+from relit.capture.photo import layers
 from relit.conventions import move_points, similarity
 from relit.errors import UserError, did_you_mean
 from relit.fit.flash_ambient import find_ambient
@@ -29,7 +30,7 @@ from relit.fit.hollows import HollowOptions, open_hollows, without
 from relit.fit.kinship import start_kinship
 from relit.fit.multiview import load_pixels, rotation_from_y, run_arrays, score_held_out
 from relit.fit.outlines import follow_outlines
-from relit.fit.pixels import SATURATED, PixelBank
+from relit.fit.pixels import PixelBank
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -126,7 +127,7 @@ def options_for(quality: str) -> FlashOptions:
     return FlashOptions(**PRESETS[quality])
 
 
-def surface_options(o: FlashOptions, saturated: float) -> FlashSurfaceOptions:
+def surface_options(o: FlashOptions) -> FlashSurfaceOptions:
     off = {}
     if "offset" in o.without:
         off["offset_rate"] = 0.0
@@ -135,8 +136,7 @@ def surface_options(o: FlashOptions, saturated: float) -> FlashSurfaceOptions:
     directions = 0 if "interreflection" in o.without else o.directions
     share = {"smooth": o.smooth} if "features" not in o.without else {"smooth": 0.0}
     shadow = "shadow" not in o.without
-    common = {"saturated": saturated, "patches": o.patches}
-    return FlashSurfaceOptions(o.surface_steps, o.points, directions, o.bounces, shadow, **common, **off, **share)
+    return FlashSurfaceOptions(o.surface_steps, o.points, directions, o.bounces, shadow, patches=o.patches, **off, **share)
 
 
 def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> Asset:
@@ -149,7 +149,7 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     check_backdrop(capture)
     bank, cameras, masks, level = load_pixels(capture, options, run)
     check_photos(bank, cameras, masks, level)
-    bank.saturated = bank.ignored = saturation(capture)
+    bank.drop_saturated = True
     coat = Coat(options.ior)
     if options.dino and not run.done("surface"):
         DinoNetwork(network_file(options.dino))  # what is wrong with it is told before anything is computed
@@ -163,18 +163,13 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
     else:
-        maps = surface_stage(bank, cameras, mesh, parts, coat, bank.saturated, run, options, seed)
+        maps = surface_stage(bank, cameras, mesh, parts, coat, run, options, seed)
     return assemble(capture, mesh, maps, world_from_unit, options.ior)
-
-
-def saturation(capture: Capture) -> float:
-    """The linear value from which on a pixel may be over-exposed: photos in EXR or HDR are not clipped."""
-    return np.inf if all(p.name.lower().endswith((".exr", ".hdr")) for p in capture.photos) else SATURATED
 
 
 def check_backdrop(capture: Capture) -> None:
     """Raises UserError where the masks were found before a plain backdrop that is not dark: other light than the flash falls on it."""
-    backdrops = [p.load.mask for p in capture.photos if isinstance(getattr(p.load, "mask", None), Backdrop)]
+    backdrops = [m for p in capture.photos for layer in layers(p.load) if isinstance(m := getattr(layer, "mask", None), Backdrop)]
     if sum(not b.dark for b in backdrops) > len(capture.photos) / 2:
         raise UserError(
             "the surroundings are not dark: the photos stand before a bright, even backdrop",
@@ -205,7 +200,8 @@ def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarra
         )
     rgbm = np.array(bank.rgbm).reshape(-1, 4)
     inside = rgbm[rgbm[:, 3] > 0.99][::7, :3]
-    burnt = float((inside.min(1) >= 0.99).mean()) if len(inside) else 0.0
+    ends = np.repeat(np.broadcast_to(np.array(bank.saturated), bank.views), np.diff([*np.array(bank.offsets), bank.total]))
+    burnt = float((inside.min(1) >= ends[rgbm[:, 3] > 0.99][::7]).mean()) if len(inside) else 0.0
     if burnt > 0.5:
         raise UserError(
             f"{100 * burnt:.0f} % of the object's pixels are over-exposed",
@@ -243,7 +239,8 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
         if options.hollows > 0 and not stage.load("checkpoint"):
             o = HollowOptions(options.hollows)
             coarse = visual_hull(cameras, masks, o.nodes)
-            values = without(values, open_hollows(bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed))
+            show = run.progress("hollows that no silhouette shows")
+            values = without(values, open_hollows(bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed, show))
         model = start(values, False)
         mirrors = options.directions > 0 and "interreflection" not in options.without
         begin_level = (lambda m: look_around(bank, cameras, m, coat)) if mirrors else None
@@ -294,9 +291,9 @@ def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: F
     return parts
 
 
-def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, saturated: float, run, options: FlashOptions, seed: int):
+def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, run, options: FlashOptions, seed: int):
     """Material and flash. Returns (and keeps) diffuse, specular, alpha, normal, offset and intensity (unit frame)."""
-    o = surface_options(options, saturated)
+    o = surface_options(options)
     network = DinoNetwork(network_file(options.dino)) if options.dino else None
     with run.stage("surface", steps=o.steps, title="material and flash (surface pass)") as stage:
         face, bary = rasterise_atlas(mesh, options.texture)

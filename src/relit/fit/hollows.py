@@ -60,17 +60,20 @@ def open_hollows(
     options: HollowOptions,
     say: Callable[[str], None],
     seed: int = 0,
+    progress: Callable[[int], None] | None = None,
 ) -> np.ndarray | None:
     """What is to be taken away from a visual hull: (n, n, n) distances, negative in the hollows, or None where there are none.
 
     values: (n, n, n) distances of the hull, n = options.nodes. cameras: unit frame. start: distances -> a fresh model of the capture kind.
+    progress: told how many steps of all trials are over.
     """
+    stage = NoStage(progress)
     o, hull = options, values < 0
     some = cameras[:: max(1, len(cameras) // 40)]
 
     def fitted(v: np.ndarray):
         model = start(v)
-        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), NoStage(), seed)
+        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), stage, seed)
         return dense_values(model.grid), *surface_error(bank, model, o, seed)
 
     shape, error, where = fitted(values)

@@ -209,7 +209,7 @@ def load_pixels(capture: Capture, options: MultiviewOptions, run):
     if shrink < 1:
         size = f"all together {options.max_pixels / 1e6:.0f} megapixels; --set max_pixels=N"
         run.say(f"photos are used at {shrink:.0%} of their size ({size})")
-    cameras, images, masks, normals = [], [], [], []
+    cameras, images, masks, normals, whites = [], [], [], [], []
     for photo in capture.photos:
         pixels, camera = photo.load(), photo.camera
         rgb, mask, normal = pixels.rgb, pixels.mask, pixels.normal
@@ -221,6 +221,7 @@ def load_pixels(capture: Capture, options: MultiviewOptions, run):
         images.append(rgb)
         masks.append(mask)
         normals.append(normal)
+        whites.append(None if pixels.clipped is None else pixels.white)
     if any(m is None for m in masks) and not all(m is None for m in masks):
         run.say("note: some photos have no mask; all photos are used without masks")
         masks = [None] * len(masks)
@@ -228,7 +229,7 @@ def load_pixels(capture: Capture, options: MultiviewOptions, run):
     weight = sum(float(m.sum()) for m in masks) if masked else sum(i.shape[0] * i.shape[1] for i in images)
     level = sum((i * (m[..., None] if masked else 1)).sum((0, 1)) for i, m in zip(images, masks, strict=False)) / max(weight, 1e-6)
     prior = normals if any(n is not None for n in normals) else None
-    bank = make_bank(cameras, images, masks, prior)
+    bank = make_bank(cameras, images, masks, prior, whites)
     return bank, cameras, masks if masked else None, np.maximum(level, 1e-3)
 
 
@@ -261,7 +262,9 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
             if options.hollows > 0 and not stage.load("checkpoint"):
                 coarse = visual_hull(cameras, masks, FIRST.nodes)
                 fresh = partial(start_model, level=level, background=None, full=True)
-                values = without(values, open_lids(bank, cameras, coarse, fresh, run.say, seed, options.hollows))
+                show = run.progress("hollows that no silhouette shows")
+                found = open_lids(bank, cameras, coarse, fresh, run.say, seed, options.hollows, progress=show)
+                values = without(values, found)
             model = start_model(values, level, None, full=False)
         else:
             try:
@@ -338,7 +341,7 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
         traced = TraceableMesh(mesh, reflecting)
         metallic, roughness = PAINT, None
         if "first_material" not in options.without and stage.load("checkpoint") is None:
-            metallic, roughness = first_material(bank, traced, start, known, mean, normals, o, seed)
+            metallic, roughness = first_material(bank, traced, start, known, mean, normals, o, seed, run.progress("metal or paint"))
             run.say(describe(metallic, roughness, known))
         model = start_surface(start, known, mean, o, normals, metallic, roughness)
         fit_surface(bank, traced, model, o, stage, seed)

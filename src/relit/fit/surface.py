@@ -16,7 +16,7 @@ import numpy as np
 from relit.fit.exchange import REFRESH, Exchange
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
-from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels
+from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels, saturated_at
 from relit.fit.preview import surface_preview
 from relit.lighting.environment import Environment
 from relit.lighting.gaussian_light import GaussianLight
@@ -177,7 +177,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         bend = slope.x * points.t + slope.y * points.b
         points.n = bent_normal(points, slope)
         a, b = reflected(points, lights, surface, environment)
-        fit = dual_loss(a, b, batch.rgb, valid, bank.saturated)
+        fit = dual_loss(a, b, batch.rgb, valid, saturated_at(bank, batch.view))
         lit = brightness(batch.rgb, surface.base, valid, options.smooth_shade)
         level = common_scale(surface, valid, options.scale_power)
         prior = material_prior(material, surface, near, valid, level, options, colour_smoothing * lit, side)
@@ -240,14 +240,14 @@ def drawn_points(bank: PixelBank, mesh: TraceableMesh, rng, count: int):
     return batch, points
 
 
-def dual_loss(a, b, target, valid, saturated: float = SATURATED):
+def dual_loss(a, b, target, valid, saturated=SATURATED):
     """Mean of `dual_values` over valid points."""
     return weighted_mean(dual_values(a, b, target, saturated), dr.select(valid, mi.Float(1), 0))
 
 
-def dual_values(a, b, target, saturated: float = SATURATED):
+def dual_values(a, b, target, saturated=SATURATED):
     """display_weight (a - L*)(b - L*), mean over channels (Float); a and b are independent estimates of L, so this is unbiased for the
-    squared error. A pixel from `saturated` on only says "at least this bright"."""
+    squared error. A pixel from `saturated` (float or Float) on only says "at least this bright"."""
     value = (a - target) * (b - target) * display_weight(target)
     mean = dr.detach((a + b) * 0.5)
     value = dr.select((target >= saturated) & (mean > target), 0, value)
