@@ -10,7 +10,6 @@ from relit.conventions import similarity
 from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals
 from relit.images import read_image, write_linear
-from relit.lighting.spherical_gaussians import SphericalGaussians, write_json
 from relit.relight import orbit, relight
 from relit.scene import Asset, Camera, Material, Mesh
 
@@ -86,8 +85,7 @@ def test_rotation_turns_the_light_about_the_objects_up(run, tmp_path):
 
 
 def test_spherical_gaussians_as_light(run, tmp_path):
-    sg = SphericalGaussians(np.array([[0, 1.0, 0]]), np.array([30.0]), np.array([[10.0, 10, 10]]))
-    write_json(tmp_path / "sky.json", sg)
+    (tmp_path / "sky.json").write_text('{"lobes": [{"axis": [0, 1, 0], "sharpness": 30, "amplitude": [10, 10, 10]}]}')
     top, bottom, _, _ = halves(relight(run, tmp_path / "sky.json", tmp_path / "out", spp=8)[0])
     assert top > 5 * bottom
 
