@@ -218,6 +218,11 @@ class Stage:
         self._shown = time.monotonic()
 
 
+def run_arrays(run: Run, stage: str, name: str) -> dict[str, np.ndarray]:
+    """Arrays that a finished stage has kept."""
+    return load_arrays(run.folder / "stages" / stage / f"{name}.npz")
+
+
 def read_stages(folder: Path) -> list[dict]:
     """The records of RUN's finished stages, see `Run.stages`."""
     records = [read_json(p) for p in (Path(folder) / "stages").glob("*/DONE")]

@@ -106,7 +106,7 @@ def test_the_asset_stands_in_the_frame_of_the_cameras():
     normal[..., 2] = 1
     maps = {"diffuse": normal + 0.2, "specular": 0.5 * one, "alpha": 0.09 * one, "normal": normal}
     maps |= {"offset": np.array([0.1, -0.05, 0]), "intensity": np.array([3.0])}
-    asset = flash.assemble(capture, scene.ball(6, 8), maps, capture.sphere.world_from_unit, 1.49)
+    asset = flash.assemble(capture, scene.ball(6, 8), maps, 1.49)
     np.testing.assert_allclose(asset.flash.offset, [0.2, -0.1, 0])
     np.testing.assert_allclose(asset.flash.intensity, 12)
     np.testing.assert_allclose(asset.material.roughness, 0.3, rtol=1e-6)

@@ -28,7 +28,6 @@ from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.instance_search import Search
 from relit.fit.instances import ANOTHER_PHOTO, View, carved, hold_distances, move_poses, moved_poses, pixel_bank
-from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, ground_colour, ground_reflectance, light_below, photo_bank, scene_mesh, set_down
@@ -36,12 +35,13 @@ from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_s
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.mesh import extract_mesh
+from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 
 __all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
@@ -210,7 +210,7 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         standing = [np.linalg.inv(p) for p in parts["poses"]]
         middle = np.mean([s[:3, 3] for s in standing], 0)
         scene_from_photo = similarity(turn, -turn @ middle)
-        ground_level = ground_colour(pixels, camera, parts["plane"])
+        ground_level = ground_colour(pixels, parts["plane"])
         whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, alone="visibility" in options.without)
         used = [(number, *shots[number]) for number in np.flatnonzero(parts["related"])]
         keys = parts["view_keys"]

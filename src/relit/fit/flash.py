@@ -14,23 +14,24 @@ settle: it is set so that the brightest diffuse albedo is BRIGHTEST.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 
 from relit.capture.photo import layers
-from relit.conventions import move_points, similarity
-from relit.errors import UserError, did_you_mean
+from relit.errors import UserError
 from relit.fit.flash_ambient import find_ambient
 from relit.fit.flash_dino import DinoNetwork, network_file
 from relit.fit.flash_features import FlashView, capture_features, network_features
 from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
 from relit.fit.hollows import HollowOptions, open_hollows, without
 from relit.fit.kinship import start_kinship
-from relit.fit.multiview import load_pixels, rotation_from_y, run_arrays, score_held_out
+from relit.fit.load_photos import load_pixels
+from relit.fit.multiview import score_held_out
 from relit.fit.outlines import follow_outlines
 from relit.fit.pixels import PixelBank
+from relit.fit.placing import placed_mesh
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -44,7 +45,9 @@ from relit.materials.rough_plastic import IOR, Coat
 from relit.rendering.shade import features_at
 from relit.rendering.shade_flash import FlashAppearance, alpha_on, start_learnt
 from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
+from relit.settings import check_parts, preset
 
 LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
@@ -94,9 +97,7 @@ class FlashOptions:
     def __post_init__(self):
         if self.directions < 0 or self.bounces < 1:
             raise ValueError("directions must be at least 0 and bounces at least 1")
-        for name in self.without:
-            if name not in WITHOUT:
-                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+        check_parts(self.without, WITHOUT)
 
 
 WITHOUT = ("offset", "shadow", "interreflection", "features", "refinement")
@@ -122,9 +123,7 @@ PRESETS = {
 
 def options_for(quality: str) -> FlashOptions:
     """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
-    if quality not in PRESETS:
-        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
-    return FlashOptions(**PRESETS[quality])
+    return FlashOptions(**preset(quality, PRESETS))
 
 
 def surface_options(o: FlashOptions) -> FlashSurfaceOptions:
@@ -145,7 +144,6 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
         raise ValueError("reconstruct needs cameras and the object sphere")
     if len(options.levels) != len(options.level_steps):
         raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
-    world_from_unit = capture.sphere.world_from_unit
     check_backdrop(capture)
     bank, cameras, masks, level = load_pixels(capture, options, run)
     check_photos(bank, cameras, masks, level)
@@ -164,7 +162,7 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
         maps = run_arrays(run, "surface", "maps")
     else:
         maps = surface_stage(bank, cameras, mesh, parts, coat, run, options, seed)
-    return assemble(capture, mesh, maps, world_from_unit, options.ior)
+    return assemble(capture, mesh, maps, options.ior)
 
 
 def check_backdrop(capture: Capture) -> None:
@@ -334,17 +332,9 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, run, 
     return maps
 
 
-def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_from_unit: np.ndarray, ior: float) -> Asset:
-    """The asset: +Y up where the capture knows its up direction; lengths in the units of the user's cameras."""
-    up = np.array([0.0, 1.0, 0.0]) if capture.up is None else np.asarray(capture.up, np.float64)
-    world_from_asset = similarity(rotation_from_y(up), capture.sphere.centre)
-    asset_from_unit = np.linalg.inv(world_from_asset) @ world_from_unit
-    radius = float(np.cbrt(np.linalg.det(asset_from_unit[:3, :3])))
-    placed = replace(
-        mesh,
-        vertices=move_points(asset_from_unit, mesh.vertices).astype(np.float32),
-        normals=(mesh.normals @ (asset_from_unit[:3, :3] / radius).T).astype(np.float32),
-    )
+def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], ior: float) -> Asset:
+    """The asset in the frame of the user's cameras (`placed_mesh`)."""
+    (placed, world_from_asset), radius = placed_mesh(capture, mesh), capture.sphere.radius
     roughness = np.sqrt(maps["alpha"])
     base = base_colour(maps["diffuse"], roughness, maps["specular"], ior)
     metallic = np.zeros((1, 1), np.float32)

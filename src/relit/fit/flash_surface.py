@@ -20,13 +20,13 @@ from relit.fit.flash_patches import draw_patches, pyramid_loss, ssim_loss
 from relit.fit.kinship import Kinship, share_evidence
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight
-from relit.fit.pixels import PixelBank, batch_of, draw_pixels, saturated_at, well_exposed
+from relit.fit.pixels import PixelBank, draw_pixels, saturated_at, well_exposed
 from relit.fit.preview import surface_preview
-from relit.fit.surface import neighbours
+from relit.fit.surface import drawn_points, dual_values, neighbours
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import PlasticField, plastic_at, project
 from relit.materials.rough_plastic import Coat, Plastic
-from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits
+from relit.rendering.transport import Points, TraceableMesh, bent_normal
 from relit.rendering.transport_flash import direct, indirect, lit
 
 
@@ -109,14 +109,9 @@ def fit_flash_surface(
 
     def step(i: int) -> dict:
         decay = cosine_decay(i / o.steps, 0.03)
-        pixel = draw_patches(bank, rng, o.points) if o.patches > 0 else draw_pixels(bank, rng, o.points)
-        dr.eval(pixel, rng)
-        batch = batch_of(bank, pixel)
-        points = first_hits(mesh, batch.o, batch.d)
-        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
-        points.valid = valid
-        calm = dr.gather(mi.Float, even, pixel)
-        dr.eval(points, batch.rgb, batch.view, calm)
+        batch, points = drawn_points(bank, mesh, rng, o.points, draw_patches if o.patches > 0 else draw_pixels)
+        valid, calm = points.valid, dr.gather(mi.Float, even, batch.pixel)
+        dr.eval(batch.view, calm)
         near = neighbours(mesh, points, o.reach, rng)
         close = neighbours(mesh, points, o.slope_reach, rng)
         dr.eval(near, close, rng)
@@ -165,12 +160,12 @@ def fit_flash_surface(
                 keep = 1 - (1 - model.kinship.own(o.own)) * dr.opaque(mi.Float, decay)
                 field.lobe = common + keep * (field.lobe - common)
                 if i % (o.share_every if 20 * i > o.steps else 2) == 0:
-                    share(i, points, batch, plastic, n, position, intensity, seen, (a + b) * 0.5 - straight, calm, sigma, decay)
+                    share(points, batch, plastic, n, position, intensity, seen, (a + b) * 0.5 - straight, calm, sigma, decay)
         project(field)
         dr.eval(model.offset, model.log_intensity, field.diffuse, field.lobe, field.slope)
         return {"colour": fit}
 
-    def share(i, points, batch, plastic, n, position, intensity, seen, bounce, calm, sigma, decay):
+    def share(points, batch, plastic, n, position, intensity, seen, bounce, calm, sigma, decay):
         n, position, intensity, bounce, plastic = (dr.detach(v) for v in (n, position, intensity, bounce, plastic))
         photo = batch.rgb - bounce
         now = direct(points, plastic, model.coat, n, position, intensity, seen)
@@ -228,10 +223,8 @@ def robust_loss(a, b, target, valid, calm, sigma, saturated):
 
     sigma: opaque Float, display value where it is a quarter. A saturated pixel says only "at least this bright".
     """
-    value = (a - target) * (b - target) * display_weight(target)
     mean = dr.detach((a + b) * 0.5)
-    value = dr.select((target >= saturated) & (mean > target), 0, value)
-    value = (value.x + value.y + value.z) / 3 * calm * robust_weight(mean - target, target, sigma)
+    value = dual_values(a, b, target, saturated) * calm * robust_weight(mean - target, target, sigma)
     return dr.sum(dr.select(valid, value, 0)) / dr.maximum(dr.sum(dr.select(valid, mi.Float(1), 0)), 1)
 
 

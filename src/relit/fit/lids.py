@@ -13,10 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label, uniform_filter
 
-from relit.fit.hollows import HollowOptions, left_without, nearest_node, ray_errors, skin_of
+from relit.fit.hollows import HollowOptions, briefly_fitted, left_without, nearest_node, ray_errors, skin_of
 from relit.fit.loop import NoStage
 from relit.fit.pixels import PixelBank
-from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.fit.volume import VolumeModel
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions, resample
 from relit.scene import Camera
@@ -53,9 +53,7 @@ def open_lids(
     some = cameras[:: max(1, len(cameras) // 40)]
 
     def errors(v: np.ndarray, o: HollowOptions):
-        model = start(v)
-        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), stage, seed)
-        return ray_errors(bank, model, o.probes, seed)
+        return ray_errors(bank, briefly_fitted(bank, start(v), o, stage, seed), o.probes, seed)
 
     known: dict[int, tuple] = {}  # errors of the shape as it is, by nodes
 

@@ -35,14 +35,6 @@ class Adam:
         dr.schedule(out, self.m, self.v)
         return out
 
-    def state(self) -> dict[str, Any]:
-        import numpy as np
-
-        return {"m": np.array(self.m), "v": np.array(self.v), "t": np.array(self.t)}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self.m, self.v, self.t = mi.Float(state["m"]), mi.Float(state["v"]), int(state["t"])
-
 
 class NoStage:
     """Stands where a stage of a run is asked for: nothing is kept. Fits that have it one after the other tell `shown` how many steps they

@@ -6,6 +6,7 @@ and light texels. Shape is fixed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -183,7 +184,9 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         prior = material_prior(material, surface, near, valid, level, options, colour_smoothing * lit, side)
         prior += slope_prior(material, bend, close, valid, options)
         if i < light_steps:
-            prior += light_prior(log_light, options) + parsimony(material, surface, points.uv, valid, level, shift, options)
+            prior += light_prior(log_light, options)
+        if i < light_steps and options.parsimony > 0:
+            prior += parsimony(material, surface, points.uv, valid, level, shift, options)
         dr.backward(fit + prior)
         gradients = [dr.grad(p) for p in params]
         dr.disable_grad(*params)
@@ -229,9 +232,10 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     return model
 
 
-def drawn_points(bank: PixelBank, mesh: TraceableMesh, rng, count: int):
-    """`count` drawn pixels (RayBatch) and the surface they show (Points), valid where a pixel is all object and not seen too flat."""
-    pixel = draw_pixels(bank, rng, count)
+def drawn_points(bank: PixelBank, mesh: TraceableMesh, rng, count: int, draw: Callable = draw_pixels):
+    """`count` drawn pixels (RayBatch) and the surface they show (Points), valid where a pixel is all object and not seen too flat. draw:
+    what draws them, called as `draw_pixels`."""
+    pixel = draw(bank, rng, count)
     dr.eval(pixel, rng)
     batch = batch_of(bank, pixel)
     points = first_hits(mesh, batch.o, batch.d)
