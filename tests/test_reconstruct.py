@@ -178,7 +178,7 @@ def test_estimate_grows_with_photos_and_quality(capture, monkeypatch):
     assert draft.seconds < high.seconds and draft.memory < high.memory
     small = estimate(open_input(capture, Job(max_side=24)), Job(quality="draft"))
     assert small.memory < draft.memory
-    check_memory(draft, "cpu")
+    check_memory(draft)
 
 
 def test_estimate_at_the_measured_capture_is_what_was_measured(capture):

@@ -51,7 +51,7 @@ def reconstruct(
     options = with_values(recipe.options_for(job.quality), from_file, f"--config {config}")
     options = with_values(with_pairs(options, pairs), settings or {}, "settings")
     cost = estimate(capture, job, kind, options)
-    check_memory(cost, chosen)
+    check_memory(cost)
     record = {"input": Path(input).resolve().name, **dataclasses.asdict(job), "capture": kind, "settings": dataclasses.asdict(options)}
     with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
         asset_folder = run.folder / "asset"

@@ -138,6 +138,11 @@ class Capture:
     kind: str = ""
 
     @property
+    def folder(self) -> Path:
+        """The folder that was opened, or that holds the file that was."""
+        return self.root if self.root.is_dir() else self.root.parent
+
+    @property
     def has_cameras(self) -> bool:
         return bool(self.photos) and all(p.camera is not None for p in self.photos)
 
