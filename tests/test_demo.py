@@ -17,7 +17,7 @@ def tiny(monkeypatch):
     from relit.asset.asset import save_asset
     from relit.capture import procedural
     from relit.capture.synthetic import object_frame
-    from relit.evaluate import protocols, report
+    from relit.evaluate import report
     from relit.images import read_image
     from relit.plan import Job, open_input
     from relit.run import Run
@@ -27,7 +27,6 @@ def tiny(monkeypatch):
         monkeypatch.setattr(module, name, value)
     for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1, "HELD_OUT": 1}.items():
         monkeypatch.setattr(report, name, value)
-    monkeypatch.setattr(protocols, "SURFACE_SAMPLES", 2000)
     real = {name: getattr(procedural, name) for name in ("pawn", "studio", "evening")}
     monkeypatch.setattr(procedural, "pawn", lambda: real["pawn"](10, 14, 16))
     monkeypatch.setattr(procedural, "studio", lambda height=8: real["studio"](8))

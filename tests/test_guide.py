@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import runpy
@@ -25,6 +26,7 @@ from relit.viewer.page import PAGE
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SOURCE = ROOT / "src" / "relit"
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 TINY = {"levels": (16,), "level_steps": (12,), "rays": 128, "faces": 300, "texture": 16, "light": 4}
 TINY |= {"surface_steps": 4, "points": 32, "directions": 4}
@@ -95,6 +97,28 @@ def test_every_link_leads_somewhere():
             if "://" not in target and not (page.parent / target).exists():
                 lost.append(f"{page.name}: {target}")
     assert not lost
+
+
+def stands(name: str) -> bool:
+    """Whether `tests/x.py`, `fit/x.py`, `fit/x.f` or `fit/x.Class.f` is there."""
+    if name.split("/")[0] in ("tests", "tools") or (SOURCE / name).exists():
+        return (ROOT / name).exists() or (SOURCE / name).exists()
+    module, *attributes = name.split(".")
+    if not (SOURCE / f"{module}.py").is_file():
+        return False
+    body = ast.parse((SOURCE / f"{module}.py").read_text()).body
+    for attribute in attributes:
+        body = next((n.body for n in body if isinstance(n, (ast.FunctionDef, ast.ClassDef)) and n.name == attribute), None)
+        if body is None:
+            return False
+    return True
+
+
+def test_every_piece_of_code_that_the_equations_and_the_method_name_is_there():
+    parts = {p.name for p in SOURCE.iterdir() if p.is_dir()} | {"tests", "tools"}
+    text = "".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("equations.md", "method.md"))
+    names = [n for n in re.findall(r"`([\w./]+)`", text) if "/" in n and n.split("/")[0] in parts]
+    assert len(names) > 60 and [n for n in names if not stands(n)] == []
 
 
 def told_flags(verb, kind) -> set[str]:

@@ -1,5 +1,6 @@
 """Pictures survive a round trip; damaged ones get an answer."""
 
+import struct
 import sys
 
 import numpy as np
@@ -127,6 +128,65 @@ def test_nan_in_an_exr_is_refused_with_its_place(tmp_path):
         images.read_image(tmp_path / "a.exr")
 
 
+def write_tiff(path, array: np.ndarray, kind: int = 3, orientation: int = 1) -> None:
+    """(H, W, C), one strip, as TIFF 6.0 says. kind: 1 of whole numbers, 3 of floats."""
+    h, w, c = array.shape
+    shorts = {256: [w], 257: [h], 258: [8 * array.itemsize] * c, 259: [1], 262: [2], 277: [c], 274: [orientation], 278: [h], 284: [1]}
+    shorts |= {339: [kind] * c} | ({338: [2]} if c == 4 else {})
+    tags = {k: (3, v) for k, v in shorts.items()} | {273: (4, [0]), 279: (4, [array.nbytes])}
+    begin = 8 + 2 + 12 * len(tags) + 4
+    extra = b"".join(struct.pack(f"<{c}H", *v) for k, (_, v) in sorted(tags.items()) if len(v) > 2)
+    tags[273] = (4, [begin + len(extra)])
+    head, at = struct.pack("<2sHIH", b"II", 42, 8, len(tags)), begin
+    for tag, (size, values) in sorted(tags.items()):
+        if len(values) > 2:
+            head, at = head + struct.pack("<HHII", tag, size, len(values), at), at + 2 * len(values)
+        else:
+            head += struct.pack("<HHI", tag, size, len(values)) + struct.pack("<I", values[0])
+    path.write_bytes(head + struct.pack("<I", 0) + extra + array.tobytes())
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+def test_a_tiff_is_turned_once(tmp_path, kind, orientation):
+    array = np.random.default_rng(0).uniform(0, 200, (6, 8, 3)).astype(kind)
+    write_tiff(tmp_path / "a.tif", array, 3 if kind is np.float32 else 1, orientation)
+    expected = images.turn_upright(array, orientation)
+    white = 1 if kind is np.float32 else np.iinfo(kind).max
+    np.testing.assert_allclose(images.read_data(tmp_path / "a.tif"), expected / white, rtol=1e-6)
+    header = images.read_header(tmp_path / "a.tif")
+    assert (header.height, header.width) == expected.shape[:2]
+    small = images.read_small(tmp_path / "a.tif").rgb
+    np.testing.assert_allclose(small, images.read_image(tmp_path / "a.tif").rgb, atol=0.004)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_tiff_of_float_colours_is_linear(tmp_path, channels):
+    path, array = tmp_path / "a.tif", np.random.default_rng(0).uniform(0, 3, (6, 8, channels)).astype(np.float32)
+    write_tiff(path, array, orientation=6)
+    array = images.turn_upright(array, 6)
+    header = images.read_header(path)
+    assert (header.width, header.height, header.alpha, header.orientation) == (6, 8, channels == 4, 6)
+    for image in (images.read_image(path), images.read_small(path)):
+        np.testing.assert_array_equal(image.rgb, array[..., :3])
+        assert image.clipped is None and (image.alpha is None) == (channels == 3)
+    array[2, 3] = np.nan
+    write_tiff(path, array)
+    with pytest.raises(UserError, match="pixels that are NaN or infinite"):
+        images.read_image(path)
+
+
+def test_a_tiff_of_floats_that_cannot_be_read_says_so(tmp_path, capfd):
+    array = np.ones((6, 8, 3), np.float32)
+    write_tiff(tmp_path / "half.tif", array.astype(np.float16))
+    write_tiff(tmp_path / "short.tif", array)
+    (tmp_path / "short.tif").write_bytes((tmp_path / "short.tif").read_bytes()[:-200])
+    for name in ("half.tif", "short.tif"):
+        with pytest.raises(UserError, match="floating-point TIFF cannot be read") as caught:
+            images.read_image(tmp_path / name)
+        assert "EXR" in caught.value.fix
+
+
 def test_a_tiff_of_grey_floats_is_linear_and_checked(tmp_path):
     grey = np.linspace(0, 2, 48, dtype=np.float32).reshape(6, 8)
     PilImage.fromarray(grey).save(tmp_path / "a.tif")
@@ -239,7 +299,6 @@ GAMMA = 2.19921875  # a curve of one number in an ICC profile: unsigned 8.8
 
 def p3_profile(name=b"Display P3") -> bytes:
     """A version 2 matrix profile (ICC.1:2001-04) with Display P3's primaries and a plain gamma."""
-    import struct
 
     def xyz(v):
         return b"XYZ " + bytes(4) + b"".join(struct.pack(">i", round(float(x) * 65536)) for x in v)

@@ -146,19 +146,22 @@ def test_photos_whose_camera_is_not_found_are_no_changed_input(capsys, tmp_path,
 
 
 def test_a_focal_length_is_that_of_the_files(capsys, tmp_path, capture, monkeypatch):
-    """--max-side shrinks the photos, and the focal length in pixels with them."""
+    """--max-side shrinks the photos, each by a factor of its own, and the focal length in pixels with them."""
     import relit.cameras.sfm as sfm
 
-    def find(capture, *, focal, **rest):
-        CALLS.append((capture.photos[0].width, focal))
+    def find(capture, *, focals, **rest):
+        groups = [len(g) for g in sfm._groups(list(capture.photos), focals)]
+        CALLS.append((capture.photos[0].width, focals[0], focals[-1], groups))
         raise UserError("far enough")
 
     monkeypatch.setattr(sfm, "find_cameras", find)
     (capture / "transforms.json").unlink()
-    side = picture(0).shape[1]
+    side, count = picture(0).shape[1], len(list((capture / "images").iterdir()))
+    last = sorted((capture / "images").iterdir())[-1]
+    Image.fromarray(np.repeat(np.repeat(np.array(Image.open(last)), 2, 0), 2, 1)).save(last)
     for more in ((), ("--max-side", side // 2)):
         assert relit(capsys, "reconstruct", capture, "-o", tmp_path / f"run{len(more)}", "--focal", "70", *more)[0] == 3
-    assert CALLS == [(side, 70.0), (side // 2, 35.0)]
+    assert CALLS == [(side, 70.0, 70.0, [count - 1, 1]), (side // 2, 35.0, 17.5, [count - 1, 1])]
 
 
 def test_a_failed_fit_leaves_no_asset_and_its_log(capsys, tmp_path, capture):
@@ -175,7 +178,7 @@ def test_estimate_grows_with_photos_and_quality(capture, monkeypatch):
     assert draft.seconds < high.seconds and draft.memory < high.memory
     small = estimate(open_input(capture, Job(max_side=24)), Job(quality="draft"))
     assert small.memory < draft.memory
-    check_memory(draft, "cpu")
+    check_memory(draft)
 
 
 def test_estimate_at_the_measured_capture_is_what_was_measured(capture):

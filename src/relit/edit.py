@@ -195,7 +195,7 @@ def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.nd
     import drjit as dr
     import mitsuba as mi
 
-    from relit.rendering.mitsuba_scene import _camera_rays
+    from relit.rendering.mitsuba_scene import camera_rays
 
     pixels = camera.width * camera.height
     total = np.zeros(pixels)
@@ -203,7 +203,7 @@ def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.nd
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, 500 + k), pixels)
         with dr.suspend_grad():
-            ray, _ = _camera_rays(scene, camera, sampler, pixels)
+            ray, _ = camera_rays(scene, camera, sampler, pixels)
             pi = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
             total += (pi.is_valid() & (pi.prim_index >= first_face)).numpy()
     return (total / samples).reshape(camera.height, camera.width)

@@ -18,7 +18,6 @@ from relit.log import available_memory, readable_bytes
 from relit.scene import Capture, Photo, Sphere
 from relit.settings import read_config, with_values
 
-KINDS = ("multiview", "flash", "duplicates", "collection")
 # The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture, run, options, seed) -> Asset,
 # and LIGHT (a phrase) and STAGES (names) for `relit inspect`. It may also hold FINDS_CAMERAS = True (photos without cameras come to it as
 # they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST (see MEASURED).
@@ -65,13 +64,11 @@ def plan_job(flags: dict, config: str | Path | None) -> tuple[Job, dict]:
 
 
 def capture_kind(asked: str) -> str:
-    """The kind that was asked for, checked: one of RECIPES, or 'auto'. Raises UserError (code 2) for kinds without a recipe."""
+    """The kind that was asked for, checked: one of RECIPES, or 'auto'. Raises UserError (code 2) for others."""
     if asked == "auto" or asked in RECIPES:
         return asked
-    if asked in KINDS:
-        what = f"--capture {asked} is not available in this version"
-        raise UserError(what, f"kinds that are reconstructed: {', '.join(RECIPES)}", code=EXIT_USAGE)
-    raise UserError(f"--capture {asked} is not known.{did_you_mean(asked, KINDS)}", code=EXIT_USAGE)
+    what = f"--capture {asked} is not known.{did_you_mean(asked, RECIPES)}"
+    raise UserError(what, f"kinds that are reconstructed: {', '.join(RECIPES)}", code=EXIT_USAGE)
 
 
 def recipe_of(kind: str) -> ModuleType:
@@ -139,7 +136,7 @@ def input_digests(capture: Capture) -> dict[str, str]:
     """Content digests of the photos, and of the cameras, masks and normal maps beside them."""
     from relit.capture.colmap_model import model_folders
 
-    root = capture.root if capture.root.is_dir() else capture.root.parent
+    root = capture.folder
     files = {root / p.name for p in (*capture.photos, *capture.held_out)}
     for folder in (root, root / "train", root / "test"):
         files |= {p for p in folder.glob("*") if p.suffix.lower() in (".json", ".npz", ".npy") or p.name.endswith(TEXTS)}
@@ -157,10 +154,10 @@ def input_digests(capture: Capture) -> dict[str, str]:
 
 def _read_with(photo: Photo) -> Iterator[Path]:
     """The mask and the normal prior that a photo is read with, wherever they lie."""
-    load = photo.load
-    while load is not None:
-        yield from (p for p in (getattr(load, "mask", None), getattr(load, "normal", None)) if isinstance(p, Path))
-        load = getattr(load, "load", None)
+    from relit.capture.photo import layers
+
+    for layer in layers(photo.load):
+        yield from (p for p in (getattr(layer, "mask", None), getattr(layer, "normal", None)) if isinstance(p, Path))
 
 
 # ---------------------------------------------------------------- cost
@@ -199,7 +196,7 @@ def estimate(capture: Capture, job: Job, kind: str = "multiview", options=None) 
     return Cost(seconds, memory, 0.1e9 if job.quality == "draft" else 0.3e9)
 
 
-def check_memory(cost: Cost, device: str) -> None:
+def check_memory(cost: Cost) -> None:
     """Raises UserError (code 5) when the job would not fit into memory."""
     free = available_memory()
     if free is not None and cost.memory > free:

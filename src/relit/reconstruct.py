@@ -51,7 +51,7 @@ def reconstruct(
     options = with_values(recipe.options_for(job.quality), from_file, f"--config {config}")
     options = with_values(with_pairs(options, pairs), settings or {}, "settings")
     cost = estimate(capture, job, kind, options)
-    check_memory(cost, chosen)
+    check_memory(cost)
     record = {"input": Path(input).resolve().name, **dataclasses.asdict(job), "capture": kind, "settings": dataclasses.asdict(options)}
     with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
         asset_folder = run.folder / "asset"
@@ -123,32 +123,31 @@ def with_cameras(capture: Capture, run: Run, job: Job) -> Capture:
     from relit.cameras.sfm import find_cameras, kept_cameras
     from relit.capture import with_grabcut
 
-    focal = _decoded_focal(capture, job.focal)
+    focals = _decoded_focals(capture, job.focal)
 
     # the finder keeps its own model in the stage's folder, so a second call after a stop is cheap
     if run.done("cameras"):
         folder = run.folder / "stages" / "cameras"
-        kept = kept_cameras(capture, seed=job.seed, workdir=folder, focal=focal)
+        kept = kept_cameras(capture, seed=job.seed, workdir=folder, focals=focals)
         if kept is None:  # found anew they would stand in a frame of their own, and what later stages have kept would not fit
             why = "the model was damaged or removed; later stages were computed from it"
             fix = f"give the same command with --overwrite to begin anew: {folder}"
             raise UserError("the cameras that this run has found cannot be read", why, fix)
         return with_grabcut(kept[0]) if job.masks == "grabcut" else kept[0]
     with run.stage("cameras", title="cameras from photos") as stage:
-        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focal=focal, say=run.say)
+        found, verdict = find_cameras(capture, seed=job.seed, workdir=stage.folder, focals=focals, say=run.say)
     run.say(str(verdict))
     return with_grabcut(found) if job.masks == "grabcut" else found  # it is seeded by the object sphere, so it had to wait for the cameras
 
 
-def _decoded_focal(capture: Capture, focal: float | None) -> float | None:
-    """--focal is in pixels of the files; the finder wants it in those of the photos as decoded (--max-side shrinks them)."""
+def _decoded_focals(capture: Capture, focal: float | None) -> list[float] | None:
+    """--focal is in pixels of the files; the finder wants it in those of each photo as decoded (--max-side shrinks large ones more)."""
     if focal is None:
         return None
     from relit.images import read_header
 
-    photo = capture.photos[0]
-    header = read_header(capture.root / photo.name)
-    return focal * max(photo.width, photo.height) / max(header.width, header.height)
+    headers = [read_header(capture.root / photo.name) for photo in capture.photos]
+    return [focal * max(p.width, p.height) / max(h.width, h.height) for p, h in zip(capture.photos, headers, strict=True)]
 
 
 def _save(run: Run, asset, capture: Capture, kind: str, job: Job, device: str) -> None:
@@ -167,7 +166,7 @@ def _save(run: Run, asset, capture: Capture, kind: str, job: Job, device: str) -
         "peak_memory": max((s["peak_memory"] for s in stages), default=0),
         "inputs": json.loads((run.folder / "inputs.json").read_text()),
     }
-    from relit.evaluate.protocols import write_own_renders
+    from relit.evaluate.roundtrip import write_own_renders
 
     with run.stage("asset", title="asset") as stage:
         write_own_renders(stage.folder, asset)  # what the file formats are judged against

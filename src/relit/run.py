@@ -96,6 +96,10 @@ class Run:
         """One log line, on stderr and in log.txt."""
         self.log.say(text)
 
+    def progress(self, title: str) -> Callable[[int], None]:
+        """A progress line for steps besides those of a stage: call it with how many are over."""
+        return Progress(self.log, title, None).update
+
     def done(self, stage: str) -> bool:
         """Did this stage run to its end, now or in an earlier process?"""
         return read_json(self.folder / "stages" / stage / "DONE") is not None
@@ -212,6 +216,17 @@ class Stage:
             folder.mkdir(exist_ok=True)
             write_srgb(folder / f"{self.name}.jpg", picture())
         self._shown = time.monotonic()
+
+
+def run_arrays(run: Run, stage: str, name: str) -> dict[str, np.ndarray]:
+    """Arrays that a finished stage has kept. Raises UserError where they cannot be read."""
+    path = run.folder / "stages" / stage / f"{name}.npz"
+    try:
+        return load_arrays(path)
+    except NO_ARRAYS as error:
+        what = f"what the finished stage '{stage}' has kept cannot be read ({type(error).__name__})"
+        why = "the file was damaged or removed; later stages were computed from it"
+        raise UserError(what, why, f"give the same command with --overwrite to begin anew: {path}") from None
 
 
 def read_stages(folder: Path) -> list[dict]:

@@ -65,7 +65,8 @@ class Pixels:
 
     rgb: (H, W, 3) float32 linear Rec.709. mask: (H, W) float32 in [0, 1], 1 on the object, or None when not known.
     normal: (H, W, 3) float32 unit normals in OpenCV camera axes (a prior read from a file), or None.
-    clipped: (H, W) bool, True where the file's code value was saturated, or None.
+    clipped: (H, W) bool, True where the file's code value was saturated; None for formats that hold no codes (EXR, HDR).
+    white: what the largest code stands for in rgb, where there are codes: 1, unless the photo was scaled.
     labels: (H, W) int32, number of the object at each pixel of a photo of duplicates, 0 where there is none, or None.
     """
 
@@ -74,6 +75,7 @@ class Pixels:
     normal: np.ndarray | None = None
     clipped: np.ndarray | None = None
     labels: np.ndarray | None = None
+    white: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,11 @@ class Capture:
     black_background: bool = False
     notes: tuple[str, ...] = field(default_factory=tuple)
     kind: str = ""
+
+    @property
+    def folder(self) -> Path:
+        """The folder that was opened, or that holds the file that was."""
+        return self.root if self.root.is_dir() else self.root.parent
 
     @property
     def has_cameras(self) -> bool:

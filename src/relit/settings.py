@@ -43,6 +43,21 @@ def with_values(options, values: dict, source: str):
         raise UserError(f"{source}: {error}", why, code=EXIT_USAGE) from None
 
 
+def preset(quality: str, presets: dict[str, dict]) -> dict:
+    """What a recipe's options are at 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
+    if quality not in presets:
+        what = f"quality '{quality}' is not known.{did_you_mean(quality, presets)}"
+        raise UserError(what, fix=f"one of: {', '.join(presets)}", code=EXIT_USAGE)
+    return presets[quality]
+
+
+def check_parts(without: Iterable[str], known: Iterable[str]) -> None:
+    """Raises ValueError for a part that a recipe does not know how to leave out (its option `without`)."""
+    for name in without:
+        if name not in known:
+            raise ValueError(f"without={name} is not known.{did_you_mean(name, known)} Known: {', '.join(known)}")
+
+
 def convert(value, hint):
     """A text or a TOML value -> a value of type `hint`: bool, int, float, str, Literal, tuple/list of those, or one of them or None."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)

@@ -110,6 +110,6 @@ def test_the_recipe_fills_both(plastic, tmp_path):
     maps |= {"offset": np.zeros(3), "intensity": np.ones(1)}
     photo = Photo("a.png", None, 48, 48, plastic.cameras[0][1])
     capture = Capture(Path("."), "test", (photo,), sphere=Sphere(np.zeros(3), 1.0))
-    made = assemble(capture, plastic.mesh, maps, capture.sphere.world_from_unit, 1.49)
+    made = assemble(capture, plastic.mesh, maps, 1.49)
     np.testing.assert_array_equal(made.material.diffuse, m.diffuse)
     np.testing.assert_allclose(made.material.base_color, m.base_color, atol=1e-6)

@@ -96,7 +96,7 @@ def test_a_fixed_focal_stays_and_strangers_are_left_out_with_a_reason(folder, tm
     for i in range(1, 5):
         (room / f"{i}.png").write_bytes((folder / "images" / f"{i}.png").read_bytes())
     images.write_srgb(room / "blank.png", np.full((HEIGHT, WIDTH, 3), 0.4))
-    found, verdict = find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focal=FOCAL)
+    found, verdict = find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 5)
     assert (verdict.registered, verdict.total) == (4, 5)
     assert "1 have fewer than 150 features" in verdict.reason and "blank.png" in verdict.reason
     assert str(verdict).startswith("4 of 5 photos registered, because ")
@@ -121,7 +121,7 @@ def test_four_photos_of_forty_are_no_capture(folder, tmp_path):
     for i in range(36):
         images.write_srgb(room / f"blank{i}.png", np.full((HEIGHT, WIDTH, 3), 0.4))
     with pytest.raises(UserError, match="too few cameras were found: 4 of 40") as caught:
-        find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focal=FOCAL)
+        find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 40)
     assert caught.value.code == EXIT_FAILED and "36 have fewer than 150 features" in caught.value.why
 
 

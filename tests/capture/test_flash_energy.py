@@ -51,6 +51,7 @@ def test_photos_under_different_energies_are_evened_out(folder):
     before = {p.name: p.load().rgb for p in open_capture(path).photos}
     for i, photo in enumerate(capture.photos):
         np.testing.assert_allclose(photo.load().rgb, before[photo.name] * (1 if i % 2 else 2), rtol=1e-6)
+        assert photo.load().white == pytest.approx(1 if i % 2 else 2) and photo.load().clipped is not None
     assert any("2 to 4" in n and "scaled" in n for n in capture.notes)
 
 

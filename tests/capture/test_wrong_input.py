@@ -114,6 +114,14 @@ def test_inverted_masks_are_turned_with_a_note(capture_folder, cameras):
     np.testing.assert_allclose(capture.photos[2].load().mask, shots.picture(cameras[2])[1], atol=0.01)
 
 
+def test_masks_of_0_and_1_are_read_with_a_note(capture_folder, cameras):
+    for i, camera in enumerate(cameras):
+        images.write_data(_made(capture_folder / "masks") / f"{i:03d}.png", (shots.picture(camera)[1] > 0.5) / 255)
+    capture = open_capture(capture_folder)
+    assert any("numbers 0 and 1" in n for n in capture.notes)
+    np.testing.assert_array_equal(capture.photos[2].load().mask, shots.picture(cameras[2])[1] > 0.5)
+
+
 def test_masks_of_the_pixels_as_stored_are_turned_with_their_photo(tmp_path, cameras):
     """Some tools ignore EXIF: their mask of a turned photo lies on its side."""
     from PIL import Image as PilImage

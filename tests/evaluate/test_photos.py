@@ -13,7 +13,8 @@ from relit.cameras.se3 import look_at
 from relit.conventions import move_pose, rotate_environment, sample_environment, similarity, world_from_gl_camera
 from relit.errors import UserError
 from relit.evaluate import photos
-from relit.evaluate.protocols import evaluate, glb_roundtrip, write_own_renders
+from relit.evaluate.protocols import evaluate
+from relit.evaluate.roundtrip import glb_roundtrip, write_own_renders
 from relit.images import write_linear
 from relit.rendering.mitsuba_scene import build_scene, render
 from relit.scene import Asset, Camera, Material, Mesh, Sphere

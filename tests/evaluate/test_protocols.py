@@ -11,6 +11,11 @@ from relit.capture.synthetic import synthesize_multiview
 from relit.conventions import move_points, move_pose, rotate_environment, scale_of, similarity
 from relit.errors import UserError
 from relit.evaluate import metrics, protocols
+from relit.evaluate.align import aligned
+from relit.evaluate.definitions import DEFINITIONS
+from relit.evaluate.results import table
+from relit.evaluate.surfaces import chamfer_figures, visible
+from relit.evaluate.truth import camera_key, load_truth
 from relit.images import write_linear, write_srgb
 from relit.scene import Asset, Mesh
 
@@ -51,7 +56,7 @@ def truth(tmp_path_factory):
         roughness=0.5,
         metallic=0.0,
     )
-    return protocols.load_truth(out)
+    return load_truth(out)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +85,7 @@ def test_the_truth_against_itself(truth, itself):
     assert value(result, "roughness_mse") < 1e-6 and value(result, "mask_iou") > 0.98
     assert value(result, "environment_mse") < 1e-9 and value(result, "novel_ssim") > 0.98
     assert value(result, "chamfer_percent") < 0.01
-    assert set(result["metrics"]) <= set(protocols.DEFINITIONS)
+    assert set(result["metrics"]) <= set(DEFINITIONS)
     assert all(entry["definition"] for entry in result["metrics"].values())
 
 
@@ -100,7 +105,7 @@ def test_a_recovered_frame_is_aligned_by_its_cameras(truth, itself):
     cameras = tuple((name, c.with_pose(move_pose(free, c.world_from_camera))) for name, c in itself.cameras)
     environment = rotate_environment(itself.environment, free)  # a turn by whole texels: nothing is lost
     asset = replace(itself, world_from_asset=free @ itself.world_from_asset, cameras=cameras, environment=environment)
-    back, how = protocols.aligned(asset, truth.train, {protocols.camera_key(n): c for n, c in cameras})
+    back, how = aligned(asset, truth.train, {camera_key(n): c for n, c in cameras})
     assert how == "sim3"
     np.testing.assert_allclose(back.world_from_asset, itself.world_from_asset, atol=1e-9)
     np.testing.assert_allclose(back.environment, itself.environment, atol=1e-3)
@@ -108,13 +113,13 @@ def test_a_recovered_frame_is_aligned_by_its_cameras(truth, itself):
 
 
 def test_a_larger_object_has_the_known_chamfer_distance_and_hidden_parts_do_not_count(truth, itself):
-    same = protocols.chamfer_figures(itself.mesh, itself.world_from_asset, truth, count=20_000)
+    same = chamfer_figures(itself.mesh, itself.world_from_asset, truth, count=20_000)
     keep = itself.mesh.faces[np.linalg.norm(itself.mesh.vertices[itself.mesh.faces[:, 0]], axis=1) > 0.5]
     assert len(keep) < len(itself.mesh.faces)
-    shell = protocols.chamfer_figures(Mesh(itself.mesh.vertices, keep), itself.world_from_asset, truth, count=20_000)
+    shell = chamfer_figures(Mesh(itself.mesh.vertices, keep), itself.world_from_asset, truth, count=20_000)
     assert shell["chamfer"] == pytest.approx(same["chamfer"], rel=0.1)
     moved = similarity(np.eye(3), [0, 0.1, 0]) @ itself.world_from_asset
-    assert same["chamfer"] < 0.01 < protocols.chamfer_figures(itself.mesh, moved, truth, count=20_000)["chamfer"] < 0.1
+    assert same["chamfer"] < 0.01 < chamfer_figures(itself.mesh, moved, truth, count=20_000)["chamfer"] < 0.1
 
 
 def test_what_can_be_seen_from_around_is_the_outer_surface(truth, itself):
@@ -122,10 +127,10 @@ def test_what_can_be_seen_from_around_is_the_outer_surface(truth, itself):
     outer = np.linalg.norm(surface.points, axis=1) > 0.5  # of the asset; the hidden ball has radius .3
     points = move_points(itself.world_from_asset, surface.points)
     cameras = [*truth.train.values(), *truth.test.values()]
-    seen = protocols.visible(itself.mesh, itself.world_from_asset, points, cameras)
+    seen = visible(itself.mesh, itself.world_from_asset, points, cameras)
     assert not seen[~outer].any() and (~outer).any()
     assert 0.8 < seen[outer].mean() <= 1  # seven cameras above -35 degrees leave some of the underside unseen
-    one = protocols.visible(itself.mesh, itself.world_from_asset, points, cameras[:1])
+    one = visible(itself.mesh, itself.world_from_asset, points, cameras[:1])
     facing = ((cameras[0].centre - points) * points).sum(1) > 0.3  # of a nearly round thing
     assert one[outer & facing].mean() > 0.97 and 0.25 < one[outer].mean() < 0.55
 
@@ -142,11 +147,11 @@ def test_missing_surface_counts_as_an_error(truth, itself):
 
 def test_an_unfinished_or_missing_truth_is_a_user_error(tmp_path):
     with pytest.raises(UserError, match="no complete truth"):
-        protocols.load_truth(tmp_path)
+        load_truth(tmp_path)
     (tmp_path / "truth").mkdir()
     (tmp_path / "truth" / "settings.json").write_text("{}")
     with pytest.raises(UserError) as error:
-        protocols.load_truth(tmp_path)
+        load_truth(tmp_path)
     assert "unfinished" in error.value.why
     (tmp_path / "truth" / "truth.json").write_text('{"settings": {')
     with pytest.raises(UserError, match="cannot be read"):
@@ -160,5 +165,5 @@ def test_the_table_shows_every_figure(truth, itself):
 
     result = {"metrics": {"novel_psnr": {"value": 33.333, "unit": "dB", "definition": "as said"}}}
     text = StringIO()
-    Console(file=text, width=120).print(protocols.table(result, "A title"))
+    Console(file=text, width=120).print(table(result, "A title"))
     assert all(word in text.getvalue() for word in ("A title", "novel_psnr", "33.33", "dB", "as said"))

@@ -1,5 +1,6 @@
 """Steps along which light and base colour change against each other."""
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,13 +19,16 @@ def start(seed=0, hats=4):
     light = np.exp(rng.normal(size=(LIGHT, 2 * LIGHT, 3)))
     colour = np.concatenate([rng.uniform(0.2, 0.5, (SIZE, SIZE, 3)), np.full((SIZE, SIZE, 1), 0.4)], -1)
     exchange = Exchange(normals, SIZE**2, LIGHT, hats)
-    exchange.refresh(light)
+    exchange.refresh(flat(light))
     return exchange, normals.reshape(-1, 3), light, colour.reshape(-1, 4)
 
 
+def flat(a):
+    return mi.Float(np.ascontiguousarray(a, np.float32).ravel())
+
+
 def move(exchange, light, colour, g_light, g_colour, rate=0.02, metallic=None):
-    to = lambda a: mi.Float(np.ascontiguousarray(a, np.float32).ravel())  # noqa: E731
-    colour, log_light = exchange.step(to(colour), to(np.log(light)), to(g_colour), to(g_light), rate, metallic)
+    colour, log_light = exchange.step(flat(colour), flat(np.log(light)), flat(g_colour), flat(g_light), rate, metallic)
     return np.array(colour).reshape(-1, 4), np.exp(np.array(log_light).reshape(light.shape))
 
 
@@ -40,11 +44,25 @@ def test_weights_of_the_hats_sum_to_one():
     np.testing.assert_allclose(w.sum(1), 1)
 
 
+@pytest.mark.parametrize("rows", [4, 16, 24, 64])
+@pytest.mark.parametrize("faces", [True, False])
+def test_shares_are_those_of_the_light(rows, faces):
+    """Against matrices in NumPy, for maps that are smaller, as large and larger than the table."""
+    light = np.exp(np.random.default_rng(rows).normal(size=(rows, 2 * rows, 3)) * 2)
+    exchange = Exchange(np.tile([0.0, 1.0, 0.0], (4, 1)) if faces else None, 4, rows)
+    exchange.refresh(flat(light))
+    d, area = environment_directions(16, 32).reshape(-1, 3), environment_solid_angles(16, 32).reshape(-1)
+    cosines = (np.maximum(d @ d.T, 0) if faces else np.ones((512, 512))) * area
+    small = cv2.resize(light.mean(-1), (32, 16), interpolation=cv2.INTER_AREA).ravel() + 1e-6
+    expected = (cosines * small) @ hat_weights(16, 4) / (cosines @ small)[:, None]
+    np.testing.assert_allclose(np.array(exchange.share).reshape(512, 32), expected, rtol=2e-5, atol=1e-9)
+
+
 def test_diffuse_radiance_stays_where_light_moves():
     """The light moves by many times what the radiance of diffuse surfaces does. Light of one colour: the table is of its mean."""
     exchange, normals, light, colour = start()
     light = np.repeat(light.mean(-1, keepdims=True), 3, -1)
-    exchange.refresh(light)
+    exchange.refresh(flat(light))
     before = diffuse(normals, light, colour)
     rng = np.random.default_rng(1)
     after_colour, after = move(exchange, light, colour, rng.normal(size=light.shape), np.zeros_like(colour), 0.05)
@@ -108,7 +126,7 @@ def test_mirrored_is_what_black_paint_reflects_under_even_light(roughness):
 def test_without_normals_every_texel_is_as_if_it_faced_all_sides():
     _, _, light, colour = start()
     exchange = Exchange(None, SIZE**2, LIGHT)
-    exchange.refresh(light)
+    exchange.refresh(flat(light))
     g = np.zeros_like(light)
     g[..., 1] = 0.1
     after_colour, after = move(exchange, light, colour, g, np.zeros_like(colour))
@@ -145,7 +163,7 @@ def test_a_step_compiles_nothing_new():
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for k in range(3):
-            exchange.refresh(light * (1 + k))
+            exchange.refresh(flat(light * (1 + k)))
             move(exchange, light, colour, rng.normal(size=light.shape), rng.normal(size=colour.shape), 0.01 * (k + 1))
         history = dr.kernel_history()
     assert history and all(k["cache_hit"] for k in history if "cache_hit" in k)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from tiny_onnx import field, tensor
 
+from relit.capture.networks import MEAN, SPREAD
 from relit.conventions import srgb_from_linear
 from relit.errors import UserError
-from relit.fit.flash_dino import KEPT, MEAN, SCALE, SPREAD, DinoNetwork, dino_features, network_file, principal, sampled, token_map
+from relit.fit.flash_dino import KEPT, SCALE, DinoNetwork, dino_features, network_file, principal, sampled, token_map
 from relit.scene import Camera
 
 PATCH, CHANNELS = 8, 5
@@ -95,17 +96,18 @@ def test_principal_components_keep_distances():
 
 @pytest.mark.parametrize("shape", [(1, 9, 4), (1, 10, 4), (1, 14, 4), (1, 4, 3, 3)])
 def test_outputs_of_all_signatures(shape):
-    assert token_map(np.zeros(shape), "n").shape == (3, 3, 4)
+    assert token_map(np.zeros(shape)).shape == (3, 3, 4)
 
 
-def test_wrong_networks(tmp_path):
+def test_wrong_networks(tmp_path, network, monkeypatch):
     with pytest.raises(UserError, match="no network at"):
         DinoNetwork(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no network")
     with pytest.raises(UserError, match="cannot be read"):
         DinoNetwork(tmp_path / "text.onnx")
+    monkeypatch.setattr(network.network, "run", lambda shown: np.zeros((1, 7, 4)))
     with pytest.raises(UserError, match="output is 1 x 7 x 4"):
-        token_map(np.zeros((1, 7, 4)), "n")
+        network.features(np.zeros((56, 56, 3)))
     with pytest.raises(UserError, match="names no file on the hub"):
         network_file("hub:some/thing")
 

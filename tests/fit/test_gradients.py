@@ -15,7 +15,7 @@ from relit.cameras.se3 import look_at
 from relit.conventions import environment_directions
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank
-from relit.fit.surface import SurfaceOptions, dual_loss, light_prior, material_prior, neighbours, parsimony, slope_prior
+from relit.fit.surface import SurfaceOptions, common_scale, dual_loss, light_prior, material_prior, neighbours, parsimony, slope_prior
 from relit.geometry.sdf import make_grid, node_positions
 from relit.lighting.environment import Environment
 from relit.materials.field import material_at, slope_at, start_material
@@ -166,10 +166,12 @@ class SurfaceScene:
         a, b = reflected(self.points, self.lights, surface, environment)
         fit = dual_loss(a, b, self.target, self.valid)
         side = mi.Float(dr.arange(mi.UInt32, dr.width(self.valid)) % 2)  # every other point began as metal
-        prior = material_prior(self.field, surface, self.near, self.valid, self.options, mi.Float(self.options.smooth_colour), side)
+        level = common_scale(surface, self.valid, self.options.scale_power)
+        smoothing = mi.Float(self.options.smooth_colour)
+        prior = material_prior(self.field, surface, self.near, self.valid, level, self.options, smoothing, side)
         bend = self.bend.x * self.points.t + self.bend.y * self.points.b
         prior += slope_prior(self.field, bend, self.close, self.valid, self.options)
-        prior += parsimony(self.field, surface, self.points.uv, self.valid, mi.UInt32(7), self.options)
+        prior += parsimony(self.field, surface, self.points.uv, self.valid, level, mi.UInt32(7), self.options)
         return fit + prior + light_prior(x["log_light"], self.options)
 
 
@@ -233,7 +235,8 @@ def test_darkening_everything_is_little_reward(scenes, darker):
     def smoothness(colour):
         scene.field.colour = mi.Float(colour.ravel())
         surface = material_at(scene.field, scene.points.uv, scene.points.valid)
-        return float(material_prior(scene.field, surface, scene.near, scene.valid, wide, mi.Float(1.0))[0])
+        level = common_scale(surface, scene.valid, wide.scale_power)
+        return float(material_prior(scene.field, surface, scene.near, scene.valid, level, wide, mi.Float(1.0))[0])
 
     expected = np.mean(np.sqrt(darker)) * smoothness(grey)
     assert smoothness(grey * np.float32([*darker, 1])) == pytest.approx(expected, rel=1e-3) and expected > 0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from relit.cameras.se3 import look_at
+from relit.fit import lids
 from relit.fit.lids import FIRST, THEN, flat_faces, open_lids, opened_at
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
@@ -49,15 +50,20 @@ def photographed(inside):
     return make_bank(cameras(), list(rgb), list(alpha)), lambda values: start_model(values, level, None, full=True)
 
 
-def found(inside):
+def found(inside, progress=None):
     bank, start = photographed(inside)
     said = []
-    gone = open_lids(bank, cameras(), distance_of(BOX), start, said.append, faces=2, first=FIRST_SMALL, then=THEN_SMALL)
+    gone = open_lids(bank, cameras(), distance_of(BOX), start, said.append, 0, 2, FIRST_SMALL, THEN_SMALL, progress)
     return gone, said
 
 
-def test_hollow_under_a_lid_is_opened():
-    gone, said = found(BOX & ~ROOM)
+def test_hollow_under_a_lid_is_opened(monkeypatch):
+    """Each face is asked for what lies under it once, but again after one was opened; the steps of all trials are counted."""
+    asked, steps, real = [], [], lids.opened_at
+    monkeypatch.setattr(lids, "opened_at", lambda inside, lid, *rest: asked.append(lid) or real(inside, lid, *rest))
+    gone, said = found(BOX & ~ROOM, steps.append)
+    assert len(asked) <= len(flat_faces(distance_of(BOX))) + 1
+    assert steps == list(range(1, len(steps) + 1)) and len(steps) >= 2 * FIRST_SMALL.steps + 2 * THEN_SMALL.steps
     assert len(said) == 1 and "falls to" in said[0]
     assert (gone < 0)[ROOM & BOX].mean() > 0.6
     assert (gone < 0)[~ROOM].mean() < 0.01

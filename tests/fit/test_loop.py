@@ -56,24 +56,6 @@ def test_the_floor_keeps_noise_from_moving_at_full_rate():
     assert moved[0.0][:100].min() > 0.38 and moved[1.0][:100].min() > 0.25
 
 
-def test_adam_goes_on_from_its_state():
-    rng = np.random.default_rng(2)
-    gradients = [mi.Float(rng.normal(size=8).astype(np.float32)) for _ in range(10)]
-
-    def run(x, adam, some):
-        for g in some:
-            x = adam.step(x, g, 0.1)
-            dr.eval(x)
-        return x
-
-    whole = run(mi.Float(np.zeros(8, np.float32)), Adam(8), gradients)
-    first = Adam(8)
-    x = run(mi.Float(np.zeros(8, np.float32)), first, gradients[:4])
-    second = Adam(8)
-    second.restore(first.state())
-    np.testing.assert_allclose(np.array(run(x, second, gradients[4:])), np.array(whole), rtol=1e-6)
-
-
 def test_cosine_decay():
     assert cosine_decay(0, 0.1) == 1 and cosine_decay(1, 0.1) == pytest.approx(0.1) and cosine_decay(0.5, 0.1) == pytest.approx(0.55)
     assert cosine_decay(-1, 0.1) == 1 and cosine_decay(7, 0.1) == pytest.approx(0.1)

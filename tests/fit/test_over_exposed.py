@@ -38,15 +38,16 @@ def test_one_channel_is_enough():
 
 def volume_after(bank, value, saturated):
     """Distances and features after a few steps."""
-    before = bank.rgbm, bank.ignored
+    before = bank.rgbm, bank.saturated
     try:
-        bank.rgbm, bank.ignored = burnt(bank, value)[1], saturated
+        bank.rgbm, bank.saturated, bank.drop_saturated = burnt(bank, value)[1], saturated, True
         start = np.linalg.norm(node_positions(16), axis=-1) - 0.65
         model = start_model(start.astype(np.float32), np.full(3, 0.4), None, full=True)
         fit_volume(bank, model, VolumeOptions((16,), (3,), 512), NoStage(), 0)
         return np.array(model.grid.row_values), np.array(model.grid.features)
     finally:
-        bank.rgbm, bank.ignored = before
+        bank.rgbm, bank.saturated = before
+        bank.drop_saturated = False
 
 
 def test_volume_pass(shot):
@@ -92,7 +93,8 @@ def test_surface_pass(shot, monkeypatch, saturated):
     kin = start_kinship(features, known, np.stack([0.5 * one, 0.2 * one], -1), groups=4)
     field = start_plastic(0.4 * np.ones((size, size, 3)), 0.5 * one, 0.2 * one)
     model = FlashModel(field, mi.Float(features.astype(np.float32).ravel()), kin, mi.Float(0, 0, 0), mi.Float([1.7]), Coat())
-    options = FlashSurfaceOptions(steps=1, points=64 * 12, directions=0, patches=0.1, saturated=saturated)
+    options = FlashSurfaceOptions(steps=1, points=64 * 12, directions=0, patches=0.1)
+    monkeypatch.setattr(bank, "saturated", saturated)
     fit_flash_surface(bank, views, mesh, model, options, NoStage(), 0)
     is_burnt = np.isin(np.arange(64 * 12), chosen)
     for weight in (*seen["share_evidence"], seen["pyramid_loss"][1], seen["ssim_loss"][1]):

@@ -7,7 +7,18 @@ import pytest
 from scipy.ndimage import binary_dilation
 
 from relit.cameras.se3 import look_at
-from relit.fit.pixels import batch_of, corrected, draw_pixels, locate, make_bank, rays_through, sphere_pixels
+from relit.fit.pixels import (
+    SATURATED,
+    batch_of,
+    corrected,
+    draw_pixels,
+    locate,
+    make_bank,
+    rays_through,
+    saturated_at,
+    sphere_pixels,
+    well_exposed,
+)
 from relit.scene import Camera
 
 SIZES = [(12, 8), (5, 9), (16, 16)]  # width, height
@@ -92,6 +103,24 @@ def test_pixels_are_drawn_evenly_from_the_candidates(photos):
     assert set(np.flatnonzero(counts)) == set(candidates)
     expected = 40_000 / len(candidates)
     assert np.abs(counts[candidates] - expected).max() < 5 * np.sqrt(expected)
+
+
+def test_what_is_over_exposed_is_told_by_the_codes_of_each_photo(photos):
+    """Codes end at white, also where a photo was scaled; radiance that is no code does not end, unless all of it does at 1."""
+    cameras, images, _ = photos
+    dark, bright = [np.full_like(im, 0.9) for im in images], [np.full_like(im, 1.5) for im in images]
+
+    def level(images, whites):
+        return np.broadcast_to(np.array(make_bank(cameras, images, [None] * 3, whites=whites).saturated), 3).tolist()
+
+    assert level(dark, None) == level(dark, [None] * 3) == level(dark, [1.0] * 3) == [SATURATED] * 3
+    assert level(bright, [None] * 3) == [np.inf] * 3
+    assert level(bright, [1.0, 2.0, 2.0]) == pytest.approx([SATURATED, 2 * SATURATED, 2 * SATURATED])
+    assert level([dark[0], bright[1], dark[2]], [1.0, None, None]) == pytest.approx([SATURATED, np.inf, np.inf])
+    bank = make_bank(cameras, bright, [None] * 3, whites=[1.0, 2.0, 1.2])
+    batch = batch_of(bank, everything(bank))
+    fine = np.array(well_exposed(batch.rgb, saturated_at(bank, batch.view)))
+    assert (fine == (np.array(batch.view) == 1)).all()
 
 
 def test_corrections_are_the_cameras_that_they_stand_for(photos):

@@ -3,15 +3,21 @@
 import numpy as np
 import pytest
 import trimesh
+from reference.sdf import eikonal_energy
 
 from relit.errors import UserError
 from relit.geometry.atlas import cells, unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.fusion import fuse_depths
-from relit.geometry.hull import ball, visual_hull
+from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh
-from relit.geometry.sdf import dense_values, eikonal_energy, make_grid, node_positions, redistance, resample, smoothness_gradient
+from relit.geometry.sdf import dense_values, make_grid, node_positions, redistance, resample, smoothness_gradient
 from relit.scene import Camera
+
+
+def ball(n: int, radius: float) -> np.ndarray:
+    """Signed distance (n, n, n) of a ball around the origin."""
+    return (np.linalg.norm(node_positions(n), axis=-1) - radius).astype(np.float32)
 
 
 def views(count=16, size=64, distance=2.5):

@@ -82,6 +82,22 @@ def test_inverted_masks_are_seen():
     assert files.judge({"a": 1 - disc(), "b": 1 - disc()}, "masks/") == (True, [])
 
 
+@pytest.mark.parametrize("suffix, top", [(".png", 255), (".tif", 65535)])
+def test_numbers_0_and_1_are_a_mask(tmp_path, suffix, top):
+    """As programs write that number objects; nearly black both. Black with noise, or a third level, is none."""
+    path, inside = tmp_path / f"a{suffix}", disc() > 0.5
+    codes = inside.astype(np.uint8 if top == 255 else np.uint16)
+    Image.fromarray(codes).save(path)
+    mask, numbered = files.read_counted(path)
+    np.testing.assert_array_equal(mask, inside)
+    assert numbered
+    for other in (codes * top, codes * 0, codes + 1, codes + codes[::-1]):
+        Image.fromarray(other.astype(codes.dtype)).save(path)
+        mask, numbered = files.read_counted(path)
+        np.testing.assert_allclose(mask, other / top, atol=1e-6)
+        assert not numbered
+
+
 def test_judgement_of_masks():
     good, black, white = disc(), np.zeros((60, 80)), np.ones((60, 80))
     assert files.judge({"a": good, "b": good, "c": black}, "masks/") == (False, ["c"])

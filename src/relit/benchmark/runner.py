@@ -14,6 +14,7 @@ from relit.benchmark.cost import COST_DEFINITIONS, machine, timed
 from relit.benchmark.results import markdown, means, table
 from relit.benchmark.suites import SUITES, Item, Suite, named
 from relit.errors import UserError, did_you_mean
+from relit.evaluate.results import entries
 from relit.files import write_text
 
 
@@ -68,8 +69,7 @@ def run_suite(
             seconds, memory = timed(command, folder / "logs" / f"{run.name}.txt")
             say(f"{name} ({variant}): {seconds:.0f} s, {memory:.2f} GB; evaluating")
             entry = evaluate(run, capture, spp=spp)
-            cost = {"seconds": seconds, "peak_memory": memory}
-            costs = {k: {"value": v, "unit": COST_DEFINITIONS[k][0], "definition": COST_DEFINITIONS[k][1]} for k, v in cost.items()}
+            costs = entries({"seconds": seconds, "peak_memory": memory}, COST_DEFINITIONS)
             entry["metrics"] = {**costs, **entry["metrics"]}
             result["runs"][variant][name] = {**entry, "run": run.name, "capture": capture.name}
             result["means"][variant] = means(result["runs"][variant])

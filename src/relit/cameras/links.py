@@ -54,7 +54,7 @@ def link_photos(
     try:
         with quiet(pycolmap):
             models = _map(pycolmap, photos, workdir, seed)
-            groups = sorted((_group(m, photos) for m in models), key=lambda g: -len(g.photos))
+            groups = sorted((_group(m) for m in models), key=lambda g: -len(g.photos))
     finally:
         shutil.rmtree(workdir, ignore_errors=True)
     taken: set[int] = set()
@@ -105,7 +105,7 @@ def _map(pycolmap, photos, workdir: Path, seed: int) -> list:
     return out
 
 
-def _group(model, photos) -> Group:
+def _group(model) -> Group:
     images = [model.image(i) for i in model.reg_image_ids()]
     numbers = np.array([int(i.name[:5]) for i in images])
     order = np.argsort(numbers)

@@ -42,32 +42,6 @@ def log_so3(rotation: np.ndarray) -> np.ndarray:
     return q[:3] * (angle / sine if sine > 1e-12 else 2.0)
 
 
-def exp_se3(xi: np.ndarray) -> np.ndarray:
-    """Twist (6,) = (translation part, rotation vector) -> (4, 4) rigid motion."""
-    xi = np.asarray(xi, dtype=np.float64)
-    out = np.eye(4)
-    out[:3, :3] = exp_so3(xi[3:])
-    out[:3, 3] = _left_jacobian(xi[3:]) @ xi[:3]
-    return out
-
-
-def log_se3(b_from_a: np.ndarray) -> np.ndarray:
-    """Inverse of `exp_se3` for rotation angles below pi."""
-    w = log_so3(b_from_a[:3, :3])
-    return np.concatenate([np.linalg.solve(_left_jacobian(w), np.asarray(b_from_a)[:3, 3]), w])
-
-
-def _left_jacobian(w: np.ndarray) -> np.ndarray:
-    theta2 = float(w @ w)
-    theta = np.sqrt(theta2)
-    if theta < 1e-4:
-        a, b = 0.5 - theta2 / 24, 1 / 6 - theta2 / 120
-    else:
-        a, b = (1 - np.cos(theta)) / theta2, (theta - np.sin(theta)) / (theta2 * theta)
-    k = hat(w)
-    return np.eye(3) + a * k + b * k @ k
-
-
 def rotation_angle(rotation: np.ndarray) -> float:
     """Angle in degrees of a (3, 3) rotation."""
     return float(np.degrees(np.linalg.norm(log_so3(rotation))))

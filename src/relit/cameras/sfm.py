@@ -77,11 +77,11 @@ class Verdict:
 
 
 def find_cameras(
-    capture: Capture, *, seed: int = 0, workdir: Path, focal: float | None = None, say: Callable[[str], None] = lambda line: None
+    capture: Capture, *, seed: int = 0, workdir: Path, focals: list[float] | None = None, say: Callable[[str], None] = lambda line: None
 ) -> tuple[Capture, Verdict]:
     """Find the cameras of `capture.photos`; photos that could not be registered are left out with a note.
 
-    focal: focal length in pixels of the photos as decoded (`Photo.width`), kept fixed; else EXIF's is refined, else it is found.
+    focals: focal length of each photo in pixels of it as decoded (`Photo.width`), kept fixed; else EXIF's is refined, else it is found.
     say: told what is being done, a line at a time.
     workdir: a folder of its own. The model found stays there: a second call with the same photos reads it instead of searching again.
     The frame is COLMAP's (arbitrary, scale as well).
@@ -94,8 +94,8 @@ def find_cameras(
     if len(photos) < 3:
         raise UserError(f"{len(photos)} photos are not enough to find cameras", "at least 3 that overlap are needed", "add photos")
     workdir = Path(workdir)
-    key = _key(capture, seed, focal)
-    kept = kept_cameras(capture, seed=seed, workdir=workdir, focal=focal)
+    key = _key(capture, seed, focals)
+    kept = kept_cameras(capture, seed=seed, workdir=workdir, focals=focals)
     if kept is not None:
         return kept
     for name in ("images", "masks", "tries", "model"):
@@ -105,9 +105,9 @@ def find_cameras(
     has_masks = all(m is not None for m in small)
     tries, best, features = [], None, {}
     with quiet(pycolmap):
-        for number, settings in enumerate(_plan(photos, capture, has_masks, focal)):
+        for number, settings in enumerate(_plan(photos, capture, has_masks, focals is not None)):
             say(f"try {number + 1}: {settings.title}")
-            found = _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_masks)
+            found = _attempt(photos, names, scales, workdir, settings, number, seed, focals, has_masks)
             took = " + ".join(f"{s:.0f}" for s in found.seconds)
             tries.append(
                 f"{settings.title}: {found.count} of {len(photos)}, {found.models} models ({took or 0} s: features, matching, mapping)"
@@ -134,17 +134,17 @@ def find_cameras(
     return result, verdict
 
 
-def kept_cameras(capture: Capture, *, seed: int = 0, workdir: Path, focal: float | None = None) -> tuple[Capture, Verdict] | None:
+def kept_cameras(capture: Capture, *, seed: int = 0, workdir: Path, focals: list[float] | None = None) -> tuple[Capture, Verdict] | None:
     """What an earlier `find_cameras` with the same arguments found, or None where nothing is kept or it cannot be read."""
-    kept = _kept(Path(workdir), _key(capture, seed, focal))
+    kept = _kept(Path(workdir), _key(capture, seed, focals))
     return None if kept is None else (_registered(capture, *kept), kept[-1])
 
 
-def _key(capture: Capture, seed: int, focal: float | None) -> list:
-    return [seed, focal, *([p.name, p.width, p.height, p.focal_hint] for p in capture.photos)]
+def _key(capture: Capture, seed: int, focals: list[float] | None) -> list:
+    return [seed, focals, *([p.name, p.width, p.height, p.focal_hint] for p in capture.photos)]
 
 
-def _plan(photos: list[Photo], capture: Capture, has_masks: bool, focal: float | None) -> list[Settings]:
+def _plan(photos: list[Photo], capture: Capture, has_masks: bool, focals_known: bool) -> list[Settings]:
     large = max(max(p.width, p.height) for p in photos) >= 800  # small photos need every feature that there is
     few = len(photos) < 20
     first = replace(STANDARD, inliers=15, start=40, start_angle=8.0) if few else STANDARD
@@ -152,7 +152,7 @@ def _plan(photos: list[Photo], capture: Capture, has_masks: bool, focal: float |
     plan = [first, LOOSE]
     if has_masks and not capture.black_background:  # the surroundings may carry the texture that the object lacks
         plan.append(replace(LOOSE, title=LOOSE.title + ", without masks", with_masks=False))
-    if focal is None and not any(p.focal_hint for p in photos):
+    if not focals_known and not any(p.focal_hint for p in photos):
         plan.append(replace(LOOSE, title=LOOSE.title + ", a longer focal length to start with", focal_factor=2.5))
     return plan
 
@@ -171,7 +171,7 @@ class _Found:
     seconds: tuple[float, ...] = ()  # features, matching, mapping
 
 
-def _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_masks) -> _Found:
+def _attempt(photos, names, scales, workdir, settings, number, seed, focals, has_masks) -> _Found:
     pycolmap = load_pycolmap()
 
     folder = workdir / "tries" / str(number)
@@ -184,12 +184,12 @@ def _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_
     extraction.sift.peak_threshold = settings.peak
     extraction.sift.max_num_features = settings.features
     extraction.sift.first_octave = -1 if settings.upsampled else 0
-    for indices in _groups(photos, scales).values():
+    for indices in _groups(photos, focals):
         p = photos[indices[0]]
         s, side = scales[indices[0]], max(p.width, p.height)
         reader = pycolmap.ImageReaderOptions(default_focal_length_factor=settings.focal_factor)
         reader.camera_model = "OPENCV" if len(indices) >= 20 else "SIMPLE_RADIAL" if len(indices) >= 5 else "SIMPLE_PINHOLE"
-        guess = focal or p.focal_hint
+        guess = focals[indices[0]] if focals else p.focal_hint
         if guess:
             reader.camera_params = _parameters(reader.camera_model, guess * s, p.width * s / 2, p.height * s / 2)
         elif settings.focal_factor != STANDARD.focal_factor:
@@ -213,7 +213,7 @@ def _attempt(photos, names, scales, workdir, settings, number, seed, focal, has_
     if not any(found.matches.values()):
         return found
     try:
-        models = pycolmap.incremental_mapping(database, images, folder, _mapping(settings, seed, threads, focal))
+        models = pycolmap.incremental_mapping(database, images, folder, _mapping(settings, seed, threads, focals is not None))
     except (RuntimeError, ValueError):  # pycolmap's word for "no first pair"; the verdict says why
         models = {}
     marks.append(time.monotonic())
@@ -236,7 +236,7 @@ def _parameters(model: str, f: float, cx: float, cy: float) -> str:
     return ",".join(f"{v:.6f}" for v in head + [0.0] * extra)
 
 
-def _mapping(settings: Settings, seed: int, threads: int, focal: float | None):
+def _mapping(settings: Settings, seed: int, threads: int, focals_known: bool):
     pycolmap = load_pycolmap()
 
     o = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, extract_colors=False)
@@ -245,18 +245,19 @@ def _mapping(settings: Settings, seed: int, threads: int, focal: float | None):
     o.mapper.init_min_tri_angle = settings.start_angle
     o.mapper.abs_pose_min_num_inliers = settings.inliers
     o.mapper.abs_pose_min_inlier_ratio = 0.2
-    if focal is not None:
+    if focals_known:
         o.ba_refine_focal_length = False
         o.mapper.abs_pose_refine_focal_length = False
     return o
 
 
-def _groups(photos: list[Photo], scales: list[float]) -> dict[tuple, list[int]]:
-    """Photos that share intrinsics: the same size and EXIF focal length."""
+def _groups(photos: list[Photo], focals: list[float] | None) -> list[list[int]]:
+    """Numbers of the photos that share intrinsics: the same size, EXIF focal length and given focal length."""
     groups = defaultdict(list)
     for i, p in enumerate(photos):
-        groups[(p.width, p.height, None if p.focal_hint is None else round(p.focal_hint, 1))].append(i)
-    return groups
+        hint = None if p.focal_hint is None else round(p.focal_hint, 1)
+        groups[(p.width, p.height, hint, None if focals is None else round(focals[i], 1))].append(i)
+    return list(groups.values())
 
 
 def _features(database: Path) -> dict[str, int]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -21,19 +20,14 @@ LEAST = 3
 
 @dataclass(frozen=True)
 class Scaled:
-    """Multiplies the radiance that `load` returns."""
+    """Multiplies the radiance that `load` returns; what was over-exposed stays so (`Pixels.white`)."""
 
     load: Callable[[], Pixels]
     factor: float
 
     def __call__(self) -> Pixels:
         pixels = self.load()
-        return replace(pixels, rgb=(pixels.rgb * np.float32(self.factor)).astype(np.float32))
-
-    @property
-    def mask(self) -> Any:
-        """Where the mask comes from, as `load` knows it."""
-        return getattr(self.load, "mask", None)
+        return replace(pixels, rgb=(pixels.rgb * np.float32(self.factor)).astype(np.float32), white=pixels.white * self.factor)
 
 
 def flash_photos(capture: Capture) -> Capture:

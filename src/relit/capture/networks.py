@@ -25,9 +25,10 @@ LEAST_AREA = 1e-4  # of the photo; smaller masks are no objects
 
 
 class Network:
-    """A network in memory. Raises UserError for files that OpenCV cannot read."""
+    """A network in memory, the one way in which Relit runs an ONNX file."""
 
     def __init__(self, file: str | Path):
+        """Raises UserError for files that OpenCV cannot read."""
         self.path = Path(file)
         if not self.path.is_file():
             raise UserError(f"no network at: {self.path}", fix="give the path of an ONNX file")
@@ -37,24 +38,31 @@ class Network:
             raise UserError("the network cannot be read", first_line(error), f"give an ONNX file: {self.path}") from None
 
     def __call__(self, rgb: np.ndarray, side: int) -> np.ndarray:
-        """(H, W, 3) linear in [0, 1] -> what the network says."""
+        """(H, W, 3) linear in [0, 1], its longer side brought to about `side` -> what the network says."""
         s = side / max(rgb.shape[:2])
         h, w = (max(MULTIPLE, round(n * s / MULTIPLE) * MULTIPLE) for n in rgb.shape[:2])
-        shown = cv2.resize(np.clip(srgb_from_linear(rgb), 0, 1).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
+        return self.run(cv2.resize(np.clip(srgb_from_linear(rgb), 0, 1).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA))
+
+    def run(self, shown: np.ndarray) -> np.ndarray:
+        """(H, W, 3) float32 sRGB values in [0, 1], at the size that the network gets -> what it says. Raises UserError where it takes none
+        of that size."""
+        h, w = shown.shape[:2]
         blob = ((shown - np.float32(MEAN)) / np.float32(SPREAD)).transpose(2, 0, 1)[None]
         try:
             self.net.setInput(np.ascontiguousarray(blob, np.float32))
             return np.asarray(self.net.forward())
         except cv2.error as error:
             raise UserError(
-                f"the network does not take a picture of {w} x {h}", first_line(error), f"export it anew: {self.path}"
+                f"the network does not take a picture of {w} x {h}", first_line(error), f"export it with free sides: {self.path}"
             ) from None
 
     def strange(self, out: np.ndarray, wanted: str) -> UserError:
+        """What to raise for an output that is not what is `wanted`."""
         return UserError(f"the network's output is {' x '.join(map(str, out.shape))}", f"{wanted} is looked for", f"see: {self.path}")
 
 
 def first_line(error: Exception) -> str:
+    """The first line of what a library says, as far as it is read."""
     return str(error).strip().splitlines()[0][:200]
 
 

@@ -16,7 +16,7 @@ from relit.capture.frames import Frame, Reading, check_max_side
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
 from relit.errors import UserError, did_you_mean
 from relit.images import Header, Image, read_small
-from relit.masks.files import find_mask, index_masks, judge, read_mask
+from relit.masks.files import find_mask, index_masks, judge, read_counted
 from relit.masks.grabcut import grabcut
 from relit.masks.segment import segmenter
 from relit.masks.threshold import Backdrop, find_backdrop
@@ -139,10 +139,7 @@ def with_grabcut(capture: Capture) -> Capture:
 
 def _is_corrected(p: Photo) -> bool:
     """Whether the mask was corrected by hand, be the photo undistorted since or not."""
-    load = p.load
-    while load is not None and not isinstance(load, Corrected):
-        load = getattr(load, "load", None)
-    return load is not None
+    return any(isinstance(layer, Corrected) for layer in photo.layers(p.load))
 
 
 def _with_facing_normals(photos: list[Photo], notes: list[str]) -> list[Photo]:
@@ -298,11 +295,14 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
             else "no mask folder was found and no file ends in _mask.png",
             f"add the masks, or use --masks none: {folder or reading.root}",
         )
-    small = [None if f.held_out else _small_mask(m, p) for f, m, p in zip(reading.frames, files, photos, strict=True)]
+    looked = [(None, False) if f.held_out else _small_mask(m, p) for f, m, p in zip(reading.frames, files, photos, strict=True)]
+    small = [mask for mask, _ in looked]
     where = f"{folder.name}/" if folder else "the mask files"
     inverted, empty = judge(_named(reading, small), where)
     small = [1.0 - m if inverted and m is not None else m for m in small]
     notes.append(f"masks come from {where}")
+    if any(numbered for _, numbered in looked):
+        notes.append("the masks hold the numbers 0 and 1 in the place of black and white: 1 is taken for the object")
     if inverted:
         notes.append("the masks were white off the object and have been inverted")
     _say_empty(empty, notes)
@@ -310,8 +310,10 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
     return [_with(p, mask=m, invert=inverted) for p, m in zip(photos, files, strict=True)], small, False
 
 
-def _small_mask(path: Path, p: Photo) -> np.ndarray:
-    return _shrunk(photo.upright_mask(read_mask(path), (p.height, p.width), p.load.orientation))
+def _small_mask(path: Path, p: Photo) -> tuple[np.ndarray, bool]:
+    """Small copy of a mask file, and whether it holds the numbers 0 and 1 (`read_counted`)."""
+    mask, numbered = read_counted(path)
+    return _shrunk(photo.upright_mask(mask, (p.height, p.width), p.load.orientation)), numbered
 
 
 def _shrunk(mask: np.ndarray) -> np.ndarray:

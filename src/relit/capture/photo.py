@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -82,7 +82,7 @@ class Undistorted:
 
         clipped = None if pixels.clipped is None else warp(pixels.clipped.astype(np.float32)) > 0
         normal = None if pixels.normal is None else _unit_normals(warp(pixels.normal))
-        return Pixels(warp(pixels.rgb), warp(pixels.mask), normal, clipped)
+        return Pixels(warp(pixels.rgb), warp(pixels.mask), normal, clipped, white=pixels.white)
 
     @property
     def mask(self) -> Any:
@@ -102,6 +102,13 @@ class Masked:
         h, w = self.shape
         mask = np.unpackbits(np.frombuffer(self.bits, np.uint8), count=h * w).reshape(h, w).astype(np.float32)
         return replace(self.load(), mask=mask)
+
+
+def layers(load: Callable[[], Pixels]) -> Iterator[Callable[[], Pixels]]:
+    """What a photo is loaded by and all that this wraps: the last one, a `Decoder`, reads the file."""
+    while load is not None:
+        yield load
+        load = getattr(load, "load", None)
 
 
 def with_mask(photo: Photo, mask: np.ndarray) -> Photo:

@@ -88,7 +88,7 @@ def synthesize_multiview(
         metallic=metallic,
         max_depth=max_depth,
     )
-    if _claim(out, settings):
+    if claim_folder(out, settings):
         return out
 
     from relit.asset.gltf import read_asset_file
@@ -96,12 +96,12 @@ def synthesize_multiview(
     from relit.rendering.mitsuba_scene import build_scene
 
     mesh, material = read_asset_file(asset_file)
-    material = _override(material, roughness, metallic)
+    material = overridden(material, roughness, metallic)
     world_from_asset = object_frame(mesh)
     train = orbit_cameras(views, resolution, seed=seed, prefix="train/r_")
     test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="test/t_")
     truth = out / "truth"
-    _write_mesh(truth / "mesh.ply", mesh, world_from_asset)
+    write_mesh(truth / "mesh.ply", mesh, world_from_asset)
     _write_transforms(out / "transforms_train.json", train, resolution)
     _write_transforms(out / "transforms_test.json", test, resolution)
 
@@ -116,11 +116,11 @@ def synthesize_multiview(
     write_linear(truth / "environment.exr", environment)
     scale_names = [train[i][0] for i in np.unique(np.linspace(0, views - 1, min(SCALE_VIEWS, views)).round().astype(int))]
     for i, (name, camera) in enumerate(train):
-        _training_view(out, scene, name, camera, spp, max_depth, seed * 1_000_003 + i, name in scale_names)
-        _report(say, "training photo", i, views)
+        write_training_view(out, scene, name, camera, spp, max_depth, seed * 1_000_003 + i, name in scale_names)
+        tell_progress(say, "training photo", i, views)
     for i, (name, camera) in enumerate(test):
-        _test_view(out, scene, name, camera, test_spp, max_depth, seed * 1_000_003 + 500_000 + i)
-        _report(say, "test view", i, test_views)
+        write_test_view(out, scene, name, camera, test_spp, max_depth, seed * 1_000_003 + 500_000 + i)
+        tell_progress(say, "test view", i, test_views)
     for j, file in enumerate(relights):
         scene, environment = lit(file)
         folder = truth / "relight" / file.stem
@@ -129,9 +129,9 @@ def synthesize_multiview(
             target = folder / f"{Path(name).name}.exr"
             if not target.exists():
                 write_linear(target, radiance(scene, camera, test_spp, max_depth, seed * 1_000_003 + 600_000 + 1000 * j + i))
-            _report(say, f"test view under {file.stem}", i, test_views)
+            tell_progress(say, f"test view under {file.stem}", i, test_views)
 
-    _write_json(
+    write_json(
         truth / "truth.json",
         {
             "settings": settings,
@@ -207,7 +207,8 @@ def exposure(scene, cameras: Sequence[tuple[str, Camera]], max_depth: int) -> fl
     return WHITE / level
 
 
-def _training_view(out: Path, scene, name: str, camera: Camera, spp: int, max_depth: int, seed: int, albedo: bool) -> None:
+def write_training_view(out: Path, scene, name: str, camera: Camera, spp: int, max_depth: int, seed: int, albedo: bool) -> None:
+    """NAME.png, and with `albedo` its base colour in truth/train_albedo; what is there already is kept."""
     photo = out / f"{name}.png"
     if not photo.exists():
         _write_rgba(photo, radiance(scene, camera, spp, max_depth, seed))
@@ -220,7 +221,8 @@ def _training_view(out: Path, scene, name: str, camera: Camera, spp: int, max_de
         write_linear(target, np.concatenate([channels["albedo"], channels["alpha"][..., None]], -1))
 
 
-def _test_view(out: Path, scene, name: str, camera: Camera, spp: int, max_depth: int, seed: int) -> None:
+def write_test_view(out: Path, scene, name: str, camera: Camera, spp: int, max_depth: int, seed: int) -> None:
+    """NAME.png, truth/test/NAME.exr and its channels; a view that is complete is kept."""
     from relit.images import write_linear
     from relit.rendering.mitsuba_scene import render_channels
 
@@ -256,7 +258,8 @@ def _check(relights, views, test_views, resolution, spp, test_spp, truth_bsdf, r
         raise UserError(f"unknown truth_bsdf '{truth_bsdf}'", fix="choose relit or principled", code=2)
 
 
-def _identity(file: Path) -> dict[str, str]:
+def identity_of(file: Path) -> dict[str, str]:
+    """{"name", "sha256"} of a file, what lies beside an OBJ or a glTF counted: the same content is the same capture."""
     digest = hashlib.sha256(file.read_bytes())
     if file.suffix.lower() in (".obj", ".gltf"):  # what they refer to lies beside them
         for sibling in sorted(p for p in file.parent.iterdir() if p.is_file() and p != file):
@@ -273,8 +276,8 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
             raise UserError(f"no {what} file: {file}", fix=f"give an existing {'GLB or OBJ' if what == 'asset' else 'HDR or EXR'} file")
     defaults = synthesize_multiview.__kwdefaults__
     plain = {key: options.get(key, value) for key, value in defaults.items() if key not in ("relights", "say")}
-    digests = {what: _identity(file) for what, file in files.items()}
-    return {"version": VERSION, "kind": "multiview", **digests, "relights": [_identity(r) for r in relights], **plain}
+    digests = {what: identity_of(file) for what, file in files.items()}
+    return {"version": VERSION, "kind": "multiview", **digests, "relights": [identity_of(r) for r in relights], **plain}
 
 
 def settings_hash(settings: dict[str, Any]) -> str:
@@ -282,7 +285,7 @@ def settings_hash(settings: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _claim(out: Path, settings: dict[str, Any]) -> bool:
+def claim_folder(out: Path, settings: dict[str, Any]) -> bool:
     """Whether `out` is complete already. Marks it as ours; refuses a folder that holds anything else."""
     marker = out / "truth" / "settings.json"
     if marker.exists():
@@ -294,18 +297,20 @@ def _claim(out: Path, settings: dict[str, Any]) -> bool:
         return (out / "truth" / "truth.json").exists()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError("the output folder is not empty and holds no synthetic capture", fix=f"choose a new folder: {out}")
-    _write_json(marker, settings)
+    write_json(marker, settings)
     return False
 
 
-def _override(material: Material, roughness: float | None, metallic: float | None) -> Material:
+def overridden(material: Material, roughness: float | None, metallic: float | None) -> Material:
+    """The material with these constants in the place of its maps, None: as it is."""
     for key, value in (("roughness", roughness), ("metallic", metallic)):
         if value is not None:
             material = replace(material, **{key: np.full_like(getattr(material, key), value)})
     return material
 
 
-def _write_json(path: Path, content: Any) -> None:
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically, its folder made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(content, indent=1))
 
@@ -315,7 +320,7 @@ def _write_transforms(path: Path, cameras: Sequence[tuple[str, Camera]], resolut
     frames = [
         {"file_path": f"./{name}", "transform_matrix": world_from_gl_camera(camera.world_from_camera).tolist()} for name, camera in cameras
     ]
-    _write_json(path, {"camera_angle_x": float(angle), "frames": frames})
+    write_json(path, {"camera_angle_x": float(angle), "frames": frames})
 
 
 def _write_rgba(path: Path, picture: np.ndarray) -> None:
@@ -327,7 +332,8 @@ def _write_rgba(path: Path, picture: np.ndarray) -> None:
     write_srgb(path, np.concatenate([rgb, alpha], -1))
 
 
-def _write_mesh(path: Path, mesh: Mesh, world_from_asset: np.ndarray) -> None:
+def write_mesh(path: Path, mesh: Mesh, world_from_asset: np.ndarray) -> None:
+    """The mesh in the world frame as PLY, atomically."""
     import trimesh
 
     from relit.images import write_bytes
@@ -336,6 +342,7 @@ def _write_mesh(path: Path, mesh: Mesh, world_from_asset: np.ndarray) -> None:
     write_bytes(path, moved.export(file_type="ply"))
 
 
-def _report(say: Callable[[str], None], what: str, index: int, count: int) -> None:
+def tell_progress(say: Callable[[str], None], what: str, index: int, count: int) -> None:
+    """'training view 10 of 36', for the first, the last and every tenth."""
     if index == 0 or index + 1 == count or (index + 1) % 10 == 0:
         say(f"{what} {index + 1} of {count}")

@@ -32,16 +32,16 @@ from relit.capture.samurai import quadrant_of
 from relit.capture.synthetic import (
     LOWEST,
     RADIUS,
-    _claim,
-    _identity,
-    _override,
-    _report,
-    _test_view,
-    _training_view,
-    _write_json,
-    _write_mesh,
+    claim_folder,
+    identity_of,
     object_frame,
+    overridden,
     radiance,
+    tell_progress,
+    write_json,
+    write_mesh,
+    write_test_view,
+    write_training_view,
 )
 from relit.conventions import sample_environment
 from relit.errors import UserError
@@ -105,7 +105,7 @@ def synthesize_collection(
     options = {"views": views, "test_views": test_views, "resolution": resolution, "spp": spp, "test_spp": test_spp, "seed": seed}
     more = {"roughness": roughness, "metallic": metallic, "rough_masks": rough_masks, "max_depth": max_depth}
     settings = settings_of(asset_file, lights, **options, **more)
-    if _claim(out, settings):
+    if claim_folder(out, settings):
         return out
 
     from relit.asset.asset import cameras_to_json
@@ -113,27 +113,27 @@ def synthesize_collection(
     from relit.images import read_image
 
     mesh, material = read_asset_file(asset_file)
-    material = _override(material, roughness, metallic)
+    material = overridden(material, roughness, metallic)
     world_from_asset = object_frame(mesh)
     shots = plan_shots(views, test_views, resolution, len(lights), seed)
-    _write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
+    write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
     frames = [{"image_name": f"{s.name}.jpg", "quadrant": quadrant_of(s.camera.centre)} for s in shots]
-    _write_json(out / "quadrants.json", {"frames": frames})
+    write_json(out / "quadrants.json", {"frames": frames})
     test = [f"{s.name}.jpg" for s in shots if s.test]
     if test:
-        _write_json(out / "held_out.json", {"frames": test})
-    _write_json(out / "truth" / "cameras.json", cameras_to_json([(f"image/{s.name}.jpg", s.camera) for s in shots]))
+        write_json(out / "held_out.json", {"frames": test})
+    write_json(out / "truth" / "cameras.json", cameras_to_json([(f"image/{s.name}.jpg", s.camera) for s in shots]))
     training = [s.name for s in shots if not s.test]
     scale_names = {training[i] for i in np.unique(np.linspace(0, len(training) - 1, min(SCALE_VIEWS, len(training))).round().astype(int))}
     environments = [read_image(file).rgb for file in lights]
     for i, shot in enumerate(shots):
         samples = test_spp if shot.test else spp
         take(out, shot, mesh, material, world_from_asset, environments, samples, max_depth, seed * 1_000_003 + i, rough_masks, scale_names)
-        _report(say, "photo", i, len(shots))
+        tell_progress(say, "photo", i, len(shots))
     sphere = {"centre": [0.0, 0.0, 0.0], "radius": RADIUS}
     head = {"settings": settings, "world_from_asset": world_from_asset.tolist(), "sphere": sphere, "ior": material.ior}
     names = {"train": training, "test": [s.name for s in shots if s.test], "train_albedo": sorted(scale_names), "relight": []}
-    _write_json(out / "truth" / "truth.json", {**head, **names})
+    write_json(out / "truth" / "truth.json", {**head, **names})
     return out
 
 
@@ -149,8 +149,8 @@ def settings_of(asset_file: str | Path, light_files: Sequence[str | Path], **opt
     return {
         "version": VERSION,
         "kind": "collection",
-        "asset": _identity(Path(asset_file)),
-        "lights": [_identity(f) for f in lights],
+        "asset": identity_of(Path(asset_file)),
+        "lights": [identity_of(f) for f in lights],
         **plain,
     }
 
@@ -215,9 +215,9 @@ def take(out: Path, shot: Shot, mesh, material, world_from_asset, environments, 
     if shot.test or shot.name in scale_names:
         lit = build_scene(mesh, material, world_from_asset, light)
         if shot.test:
-            _test_view(out / "truth" / "png", lit, shot.name, camera, spp, max_depth, seed)
+            write_test_view(out / "truth" / "png", lit, shot.name, camera, spp, max_depth, seed)
         else:
-            _training_view(out / "truth" / "png", lit, shot.name, camera, 16, 2, seed, True)
+            write_training_view(out / "truth" / "png", lit, shot.name, camera, 16, 2, seed, True)
         keep_truth(out)
     rgba = radiance(scene, camera, spp, max_depth, seed)
     rgba[..., :3] *= gain

@@ -22,7 +22,17 @@ import cv2
 import numpy as np
 
 from relit.cameras.se3 import exp_so3, look_at, rotation_from
-from relit.capture.synthetic import RADIUS, _claim, _identity, _override, _report, _write_json, exposure, object_frame, radiance
+from relit.capture.synthetic import (
+    RADIUS,
+    claim_folder,
+    exposure,
+    identity_of,
+    object_frame,
+    overridden,
+    radiance,
+    tell_progress,
+    write_json,
+)
 from relit.conventions import move_points, similarity, world_from_gl_camera
 from relit.errors import UserError
 from relit.scene import Camera, Ground, Mesh
@@ -70,7 +80,7 @@ def synthesize_duplicates(
     relights = [Path(r) for r in relights]
     _check(options, relights)
     settings = settings_of(asset_file, light_file, relights=relights, **options)
-    if _claim(out, settings):
+    if claim_folder(out, settings):
         return out
 
     from relit.asset.gltf import read_asset_file
@@ -79,7 +89,7 @@ def synthesize_duplicates(
     from relit.rendering.pile import build_pile, instance_ids
 
     mesh, material = read_asset_file(asset_file, nodes)
-    material = _override(material, roughness, metallic)
+    material = overridden(material, roughness, metallic)
     poses, reach = heap(mesh, count, seed, lean, spread)
     ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 5 * reach, np.array(GROUND_COLOUR), GROUND_ROUGHNESS)
     pile = build_pile(mesh, material, poses, ground)
@@ -117,7 +127,7 @@ def synthesize_duplicates(
                 write_linear(truth / "test" / f"{name}_{key}.exr", channels[key])
             rgb = render(scene, view, spp=test_spp, seed=seed + 50 + i, max_depth=max_depth)[..., :3]
             write_linear(target, np.concatenate([rgb, alpha], -1))  # coverage of the objects, the ground left out
-        _report(say, "test view", i, len(tests))
+        tell_progress(say, "test view", i, len(tests))
     for j, file in enumerate(relights):
         scene, light = lit(file)
         write_linear(truth / "relight" / f"{file.stem}.exr", light)
@@ -127,9 +137,9 @@ def synthesize_duplicates(
                 write_linear(target, render(scene, view, spp=test_spp, seed=seed + 90 + 40 * j + i, max_depth=max_depth))
         say(f"test views under {file.stem}")
     _write_mesh(truth / "mesh.ply", mesh)
-    _write_json(out / "transforms_train.json", _cameras([(f"train/{k:03d}", c) for k, c in enumerate(shots)]))
-    _write_json(out / "transforms_test.json", _cameras([(f"test/{n}", c) for n, c in tests]))
-    _write_json(
+    write_json(out / "transforms_train.json", _cameras([(f"train/{k:03d}", c) for k, c in enumerate(shots)]))
+    write_json(out / "transforms_test.json", _cameras([(f"test/{n}", c) for n, c in tests]))
+    write_json(
         truth / "truth.json",
         {
             "settings": settings,
@@ -156,8 +166,8 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
     defaults = synthesize_duplicates.__kwdefaults__
     plain = {key: options.get(key, value) for key, value in defaults.items() if key not in ("relights", "say")}
     plain["nodes"] = list(plain["nodes"])
-    identities = {what: _identity(file) for what, file in files.items()}
-    return {"version": VERSION, "kind": "duplicates", **identities, "relights": [_identity(r) for r in relights], **plain}
+    identities = {what: identity_of(file) for what, file in files.items()}
+    return {"version": VERSION, "kind": "duplicates", **identities, "relights": [identity_of(r) for r in relights], **plain}
 
 
 def _check(o: dict, relights: list[Path]) -> None:

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from relit.capture.iron import AXES
-from relit.capture.synthetic import _claim, _identity, _report, _write_json, _write_mesh, object_frame, orbit_cameras
+from relit.capture.synthetic import claim_folder, identity_of, object_frame, orbit_cameras, tell_progress, write_json, write_mesh
 from relit.conventions import srgb_from_linear
 from relit.errors import UserError
 from relit.files import write_text
@@ -75,7 +75,7 @@ def synthesize_flash(
         raise UserError("the flash's offset must be three numbers, together no longer than 1", "the object's radius is 0.8", code=2)
     options = {"views": views, "test_views": test_views, "nodes": list(nodes), "resolution": resolution, "spp": spp, "test_spp": test_spp}
     settings = settings_of(asset_file, **options, seed=seed, offset=list(offset), max_depth=max_depth, png=png)
-    if _claim(out, settings):
+    if claim_folder(out, settings):
         return out
 
     from relit.asset.gltf import read_asset_file
@@ -87,7 +87,7 @@ def synthesize_flash(
     train = orbit_cameras(views, resolution, seed=seed, prefix="r_")
     test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="t_")
     scene = build_flash_scene(mesh, material, world_from_asset)
-    _write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
+    write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
     flash = Flash(np.array(offset, np.float64), np.full(3, exposure(scene, train, np.array(offset, np.float64), max_depth)))
     write_text(out / "light.txt", f"{flash.intensity[0]:.8g}\n")
     write_text(out / "light_offset.txt", f"{AXES}\n" + " ".join(f"{v:.8g}" for v in flash.offset) + "\n")
@@ -100,16 +100,16 @@ def synthesize_flash(
             lambda c=camera, i=i: render_flash(scene, c, flash, spp, seed=seed * 1_000_003 + i, max_depth=max_depth),
             png,
         )
-        _report(say, "training photo", i, views)
+        tell_progress(say, "training photo", i, views)
     for i, (name, camera) in enumerate(test):
         number = seed * 1_000_003 + 500_000 + i
         _test_maps(out, scene, name, camera)
         _photo(out / "test", name, lambda c=camera, k=number: render_flash(scene, c, flash, test_spp, seed=k, max_depth=max_depth), False)
-        _report(say, "test view", i, test_views)
+        tell_progress(say, "test view", i, test_views)
     head = {"settings": settings, "world_from_asset": world_from_asset.tolist(), "sphere": {"centre": [0.0, 0.0, 0.0], "radius": 0.8}}
     names = {"train": [n for n, _ in train], "test": [n for n, _ in test]}
     light = {"offset": flash.offset.tolist(), "intensity": flash.intensity.tolist()}
-    _write_json(out / "truth" / "truth.json", {**head, **names, "flash": light, "ior": material.ior})
+    write_json(out / "truth" / "truth.json", {**head, **names, "flash": light, "ior": material.ior})
     return out
 
 
@@ -120,7 +120,7 @@ def settings_of(asset_file: str | Path, light_file=(), **options: Any) -> dict[s
         raise UserError(f"no asset file: {asset}", fix="give an existing GLB or OBJ file")
     plain = {key: options.get(key, value) for key, value in synthesize_flash.__kwdefaults__.items() if key not in ("relights", "say")}
     plain = {key: list(value) if isinstance(value, (tuple, list)) else value for key, value in plain.items()}
-    return {"version": VERSION, "kind": "flash", "asset": _identity(asset), **plain}
+    return {"version": VERSION, "kind": "flash", "asset": identity_of(asset), **plain}
 
 
 # ---------------------------------------------------------------- the material

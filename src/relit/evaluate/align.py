@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from relit.cameras import se3
-from relit.conventions import move_pose
+from relit.conventions import move_pose, rotate_environment, scale_of
 from relit.errors import UserError
-from relit.scene import Camera
+from relit.scene import Asset, Camera, Flash
 
 
 def umeyama(source, target, with_scale: bool = True) -> np.ndarray:
@@ -71,3 +73,17 @@ def same_frame(recovered: dict[str, Camera], truth: dict[str, Camera]) -> bool:
     centres = np.array([truth[n].centre for n in names])
     spread = np.linalg.norm(centres - centres.mean(0), axis=1).mean()
     return bool(np.median(rotations) < 5.0 and np.median(distances) <= 0.05 * max(spread, 1e-12))
+
+
+def aligned(asset: Asset, truth: dict[str, Camera], recovered: dict[str, Camera]) -> tuple[Asset, str]:
+    """The asset carried into the frame of the true cameras, and how: 'identity' when its cameras stand there already (they were given) or
+    it has none, 'sim3' when they were recovered from photos and the frame is free."""
+    if not recovered or same_frame(recovered, truth):
+        return asset, "identity"
+    s = align_cameras(recovered, truth)
+    k = scale_of(s)
+    flash = None if asset.flash is None else Flash(asset.flash.offset * k, asset.flash.intensity * k**2)
+    environment = None if asset.environment is None else rotate_environment(asset.environment, s)
+    cameras = tuple((name, camera.with_pose(move_pose(s, camera.world_from_camera))) for name, camera in asset.cameras)
+    placed = s @ asset.world_from_asset
+    return replace(asset, world_from_asset=placed, environment=environment, cameras=cameras, flash=flash), "sim3"

@@ -17,8 +17,12 @@ from relit.cameras.se3 import align_cameras as align_poses
 from relit.cameras.se3 import camera_errors, nearest_rotation, rotation_angle, umeyama
 from relit.conventions import move_points, move_pose, similarity
 from relit.errors import UserError
+from relit.evaluate import definitions
 from relit.evaluate import metrics as m
-from relit.evaluate.protocols import Truth, camera_key, chamfer_figures, entry, fixed_albedo_scale, material_figures
+from relit.evaluate.protocols import fixed_albedo_scale, material_figures
+from relit.evaluate.results import entries, means
+from relit.evaluate.surfaces import chamfer_figures
+from relit.evaluate.truth import Truth, camera_key
 from relit.scene import Asset, Camera
 
 WITHIN = 10.0  # degrees
@@ -39,7 +43,7 @@ DEFINITIONS = {
 
 
 def load_collection_truth(folder: str | Path) -> Truth:
-    """The truth of a synthetic collection as `protocols.Truth`. Raises UserError where it is not complete."""
+    """The truth of a synthetic collection as `evaluate.truth.Truth`. Raises UserError where it is not complete."""
     from relit.asset.asset import read_cameras, read_json
 
     folder = Path(folder)
@@ -74,10 +78,9 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
     scale = fixed_albedo_scale(scene, truth)
     for name, camera in truth.test.items():
         per_view.setdefault(name, {}).update(material_figures(scene, camera, truth, name, scale))
-    for key in sorted({k for figures in per_view.values() for k in figures}):
-        values[key] = float(np.mean([figures[key] for figures in per_view.values() if key in figures]))
+    values.update(means(per_view))
     values.update(chamfer_figures(placed.mesh, placed.world_from_asset, truth))
-    metrics = {k: v for name, value in values.items() for k, v in (named if name in DEFINITIONS else entry)(name, value).items()}
+    metrics = entries(values, {**definitions.DEFINITIONS, **DEFINITIONS})
     return {"metrics": metrics, "per_view": per_view, "albedo_scale": [float(x) for x in scale], "alignment": "sim3"}
 
 
@@ -86,12 +89,6 @@ def check_lights(asset: Asset) -> None:
     if not asset.lights:
         why = "the photos were taken under different lights; only a collection's asset holds the light of each"
         raise UserError("the asset has no light for each photo", why, "reconstruct with --capture collection")
-
-
-def named(name: str, value: float, note: str = "") -> dict[str, dict[str, Any]]:
-    """{name: {"value", "unit", "definition"}} of a figure of this module. note: what the definition says besides."""
-    unit, definition = DEFINITIONS[name]
-    return {name: {"value": float(value), "unit": unit, "definition": definition + note}}
 
 
 def pose_figures(

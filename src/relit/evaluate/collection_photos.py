@@ -13,8 +13,9 @@ import numpy as np
 
 from relit.capture import llff
 from relit.errors import UserError
-from relit.evaluate.collection import check_lights, named, picture_figures, pose_figures
+from relit.evaluate.collection import DEFINITIONS, check_lights, picture_figures, pose_figures
 from relit.evaluate.photos import SIDE, capture_of, shrunk
+from relit.evaluate.results import entries
 from relit.masks.grabcut import centre_cut
 from relit.scene import Asset, Camera, Capture, Photo
 
@@ -59,8 +60,8 @@ def evaluate_on_collection(asset: Asset, folder: Path, *, run: Path | None = Non
         notes[key] = f"; photos shrunk to at most {SIDE} pixels a side, their masks for the true coverage{masks}"
     for key in sorted({k for figures in per_view.values() for k in figures}):
         values[key] = float(np.nanmean([figures[key] for figures in per_view.values() if key in figures]))
-    metrics = {k: v for name, value in values.items() for k, v in named(name, value, notes[name]).items()}
-    return {"metrics": metrics, "per_view": per_view, "photos": len(held), "alignment": "sim3"}
+    noted = {name: (unit, text + notes[name]) for name, (unit, text) in DEFINITIONS.items() if name in values}
+    return {"metrics": entries(values, noted), "per_view": per_view, "photos": len(held), "alignment": "sim3"}
 
 
 def true_cameras(capture: Capture) -> tuple[dict[str, Camera], str]:

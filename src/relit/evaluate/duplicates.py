@@ -17,6 +17,7 @@ from relit.cameras.se3 import nearest_rotation, rotation_angle
 from relit.conventions import move_points, similarity, world_from_cv_camera
 from relit.errors import UserError
 from relit.evaluate import metrics as m
+from relit.evaluate.results import entries, means
 from relit.files import parse_toml
 from relit.scene import Asset, Camera, Ground, Pixels
 
@@ -140,13 +141,9 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     values["environment_mse"] = m.environment_mse(asset.environment, light)
     values["environment_mse_scaled"] = m.environment_mse(asset.environment / factor, light)
     values["photo_psnr"] = photo_figure(asset, folder, spp=spp, seed=seed)
-    names = {key for view in per_view.values() for key in view}
-    for key in {k.split(":")[0] for k in names}:
-        values[key] = float(np.mean([v for view in per_view.values() for k, v in view.items() if k.split(":")[0] == key]))
+    values |= means(per_view)
     return {
-        "metrics": {
-            k: {"value": float(values[k]), "unit": u, "definition": d} for k, (u, d) in DUPLICATES_DEFINITIONS.items() if k in values
-        },
+        "metrics": entries(values, DUPLICATES_DEFINITIONS),
         "per_view": per_view,
         "albedo_scale": [float(x) for x in factor],
         "alignment": "scale about the camera",
@@ -170,8 +167,7 @@ def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 64, se
         if len(before) == len(poses):
             earlier = pose_figures(before, reference, {})
             values["rotation_before"], values["pairs_before"] = earlier["rotation_median"], earlier["rotation_pairs"]
-    metrics = {k: {"value": float(values[k]), "unit": u, "definition": d} for k, (u, d) in DUPLICATES_DEFINITIONS.items() if k in values}
-    return {"metrics": metrics, "per_view": {}}
+    return {"metrics": entries(values, DUPLICATES_DEFINITIONS), "per_view": {}}
 
 
 def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:

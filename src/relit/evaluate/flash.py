@@ -16,6 +16,9 @@ import numpy as np
 
 from relit.errors import UserError
 from relit.evaluate import metrics as m
+from relit.evaluate.align import aligned
+from relit.evaluate.results import entries, means
+from relit.evaluate.surfaces import chamfer_figures
 from relit.scene import Asset, Camera, Flash
 
 RATIO = "times the ratio of intensities, predicted over true (albedos and intensity share a factor)"
@@ -95,8 +98,6 @@ def load_flash_truth(folder: str | Path) -> FlashTruth:
 
 def placed(asset: Asset, truth: FlashTruth) -> Asset:
     """The asset in the frame of the true cameras: as it is where they were given, else moved, with its flash, by a similarity."""
-    from relit.evaluate.protocols import aligned
-
     return aligned(asset, truth.train, {Path(name).stem: camera for name, camera in asset.cameras})[0]
 
 
@@ -112,7 +113,6 @@ def evaluate_flash(run_or_asset: str | Path, truth_folder: str | Path, *, spp: i
 
 def evaluate_flash_asset(asset: Asset, truth: FlashTruth, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
     """As `evaluate_flash`, for an asset in memory."""
-    from relit.evaluate.protocols import chamfer_figures
     from relit.lighting.flash import seen_angle
     from relit.rendering.flash_scene import build_flash_scene
 
@@ -124,14 +124,12 @@ def evaluate_flash_asset(asset: Asset, truth: FlashTruth, *, spp: int = 256, see
     per_view = {
         name: view_figures(scene, asset, truth, name, camera, ratio, spp, seed + i) for i, (name, camera) in enumerate(truth.test.items())
     }
-    names = {key for figures in per_view.values() for key in figures}
-    values = {key: float(np.mean([figures[key] for figures in per_view.values()])) for key in names}
+    values = means(per_view)
     values["flash_angle"] = seen_angle(asset.flash, truth.flash, list(truth.test.values()), truth.centre)
     values["intensity_ratio"] = ratio
     if (truth.folder / "truth" / "mesh.ply").is_file():
         values["chamfer_percent"] = chamfer_figures(asset.mesh, asset.world_from_asset, truth)["chamfer_percent"]
-    metrics = {k: {"value": values[k], "unit": unit, "definition": text} for k, (unit, text) in FLASH_DEFINITIONS.items() if k in values}
-    return {"metrics": metrics, "per_view": per_view}
+    return {"metrics": entries(values, FLASH_DEFINITIONS), "per_view": per_view}
 
 
 def view_figures(scene, asset: Asset, truth: FlashTruth, name: str, camera: Camera, ratio: float, spp: int, seed: int) -> dict[str, float]:

@@ -17,7 +17,9 @@ from relit.capture.flash_energy import flash_photos
 from relit.conventions import sample_environment
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.align import pose_errors
+from relit.evaluate.align import aligned, pose_errors
+from relit.evaluate.results import entries
+from relit.evaluate.truth import camera_key
 from relit.files import parse_toml
 from relit.scene import Asset, Camera, Capture, Photo, Sphere
 
@@ -56,7 +58,6 @@ def evaluate_on_photos(asset: Asset, folder: Path, *, run: Path | None = None, s
 
     Returns as `protocols.evaluate`. Raises UserError when the folder is no capture, has no cameras, or shares no photo with the asset.
     """
-    from relit.evaluate.protocols import aligned, camera_key
     from relit.rendering.photographed import as_photographed
 
     if asset.environment is None and asset.flash is None:
@@ -74,12 +75,8 @@ def evaluate_on_photos(asset: Asset, folder: Path, *, run: Path | None = None, s
     show = as_photographed(asset)
     per_view = {p.name: photo_figures(show, asset, p, capture.sphere, spp, seed + i) for i, p in enumerate(photos)}
     names = [n for n in _FIGURES if any(n in v for v in per_view.values())]
-    values = {n: float(np.nanmean([v[n] for v in per_view.values() if n in v])) for n in names}
-    meaning = definitions(prefix, "recovered light" if asset.flash is None else "under the recovered moving flash")
-    metrics = {}
-    for name, value in values.items():
-        unit, definition = meaning[f"{prefix}_{name}"]
-        metrics[f"{prefix}_{name}"] = {"value": value, "unit": unit, "definition": definition}
+    values = {f"{prefix}_{n}": float(np.nanmean([v[n] for v in per_view.values() if n in v])) for n in names}
+    metrics = entries(values, definitions(prefix, "recovered light" if asset.flash is None else "under the recovered moving flash"))
     metrics |= camera_figures({camera_key(name): c for name, c in asset.cameras}, given) if alignment == "sim3" else {}
     return {"metrics": metrics, "per_view": per_view, "photos": len(photos), "alignment": alignment}
 
@@ -155,4 +152,4 @@ def camera_figures(recovered: dict[str, Camera], given: dict[str, Camera]) -> di
     """How far the recovered cameras, already aligned, are from the given ones."""
     rotations, _ = pose_errors(recovered, given, np.eye(4))
     text = "median rotation error of the recovered cameras against the capture's own, after Sim(3) alignment"
-    return {"camera_rotation": {"value": float(np.median(rotations)), "unit": "degrees", "definition": text}}
+    return entries({"camera_rotation": float(np.median(rotations))}, {"camera_rotation": ("degrees", text)})

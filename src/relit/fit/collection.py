@@ -30,20 +30,20 @@ from relit.fit.collection_options import CollectionOptions, options_for
 from relit.fit.collection_photos import LEAST_PHOTOS, Shot, crops_of, load_shots
 from relit.fit.collection_poses import GREY, agreement, schedule_of
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, posterior, start_collection_surface
-from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, restore_model, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import visual_hull
-from relit.geometry.mesh import extract_mesh
+from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.per_photo import COLUMNS, ROWS
 from relit.materials.field import normal_map, pictures, start_material
 from relit.rendering.shade import features_at
 from relit.rendering.shade_photos import shade_photos, start_photo_lights
 from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
 
 __all__ = ["LEAST_PHOTOS", "CollectionOptions", "options_for", "reconstruct"]

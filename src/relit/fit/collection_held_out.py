@@ -15,15 +15,16 @@ from relit.fit.collection_photos import Shot, crops_of
 from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, best_refined
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, start_collection_surface
 from relit.fit.loop import NoStage
-from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.pixels import corrected, make_bank
 from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, near, refine, search, views_from, volume_render
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.geometry.mesh import vertex_areas
 from relit.lighting.per_photo import COLUMNS, ROWS
 from relit.materials.field import start_material
 from relit.rendering.shade_photos import shade_photos, shade_plain, start_photo_lights
 from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
 from relit.scene import Camera
 
 AGAIN = 600  # viewpoints that a finished model is looked at from

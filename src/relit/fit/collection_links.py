@@ -20,7 +20,7 @@ from relit.errors import UserError
 from relit.fit.collection_framing import is_cut, slide
 from relit.fit.collection_photos import Shot
 from relit.fit.collection_poses import COARSE, HINT, PARTS, SLACK, best_refined, coarse_model
-from relit.fit.multiview import resize, run_arrays
+from relit.fit.load_photos import resize
 from relit.fit.register import (
     Crop,
     crop_rings,
@@ -33,6 +33,7 @@ from relit.fit.register import (
     views_from,
     volume_render,
 )
+from relit.run import run_arrays
 
 BEGINS = 8  # photos of a group from which on the shape begins with it
 FITS = 0.8  # mean score of its photos in a model of themselves, below which a group is not believed

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from relit.errors import UserError, did_you_mean
+from relit.settings import check_parts, preset
 
 WITHOUT = ("quadrants", "search", "multiplex", "posterior", "coarse_to_fine", "light_prior", "links")
 
@@ -63,9 +63,7 @@ class CollectionOptions:
     def __post_init__(self):
         if self.lambda_a <= 0 or min(self.lambda_c) <= 0:
             raise ValueError("lambda_a and lambda_c must be positive")
-        for name in self.without:
-            if name not in WITHOUT:
-                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+        check_parts(self.without, WITHOUT)
 
 
 PRESETS = {
@@ -98,6 +96,4 @@ PRESETS = {
 
 def options_for(quality: str) -> CollectionOptions:
     """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
-    if quality not in PRESETS:
-        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
-    return CollectionOptions(**PRESETS[quality])
+    return CollectionOptions(**preset(quality, PRESETS))

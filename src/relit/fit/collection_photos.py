@@ -11,7 +11,7 @@ from relit.capture.samurai import Hints, read_hints
 from relit.errors import UserError
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_poses import even_colours
-from relit.fit.multiview import resize
+from relit.fit.load_photos import resize
 from relit.fit.register import Crop, crop_photo
 from relit.masks.grabcut import centre_cut
 from relit.scene import Camera, Capture, Photo

@@ -16,13 +16,13 @@ from relit.fit.broad_steps import BroadSteps
 from relit.fit.collection_options import CollectionOptions
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
-from relit.fit.pixels import PixelBank, batch_of, draw_pixels
+from relit.fit.pixels import PixelBank, saturated_at
 from relit.fit.preview import surface_preview
-from relit.fit.surface import SurfaceOptions, material_prior, neighbours, parsimony
+from relit.fit.surface import SurfaceOptions, common_scale, drawn_points, dual_values, material_prior, neighbours, parsimony
 from relit.lighting.neural_pil import load_neural_pil
 from relit.lighting.per_photo import TEXELS, LightComponents, PhotoLights, light_prior, log_lights, mean_level
 from relit.materials.field import MaterialField, material_at, project, slope_at
-from relit.rendering.transport import TraceableMesh, bent_normal, first_hits, reflected, sample_lights
+from relit.rendering.transport import TraceableMesh, bent_normal, reflected, sample_lights
 
 LEAST = 0.02  # weight of a silenced photo: the material hardly hears it, its own light still follows
 HISTORY = 1000  # losses in the ring buffer of posterior scaling
@@ -128,13 +128,9 @@ def fit_collection_surface(
         nonlocal running
         decay = cosine_decay(i / options.steps, 0.05)
         warm = min(1.0, 0.05 + (i / (options.warm * options.steps)) ** 2)
-        pixel = draw_pixels(bank, rng, count)
-        dr.eval(pixel, rng)
-        batch = batch_of(bank, pixel)
-        points = first_hits(mesh, batch.o, batch.d)
-        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
-        points.valid = valid
-        dr.eval(points, batch.rgb, batch.view)
+        batch, points = drawn_points(bank, mesh, rng, count)
+        valid = points.valid
+        dr.eval(batch.view)
         near = neighbours(mesh, points, options.similarity_reach, rng)
         dr.eval(near, rng)
         shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (count - 1))
@@ -159,13 +155,15 @@ def fit_collection_surface(
         a, b = reflected(points, drawn, surface, of)
         heard = np.maximum(model.weights, LEAST).astype(np.float32)
         weight = dr.gather(mi.Float, mi.Float(heard), batch.view)
-        each = residuals(a, b, batch.rgb, bank.saturated)
+        each = dual_values(a, b, batch.rgb, saturated_at(bank, batch.view))
         fit = weighted_mean(each, dr.select(valid, weight, 0))
         loss = fit
         if not frozen:
             smoothing = dr.opaque(mi.Float, options.smooth_colour)
-            loss = loss + material_prior(material, surface, near, valid, options, smoothing)
-            loss = loss + parsimony(material, surface, points.uv, valid, shift, options)
+            scale = common_scale(surface, valid, options.scale_power)
+            loss = loss + material_prior(material, surface, near, valid, scale, options, smoothing)
+            if options.parsimony > 0:
+                loss = loss + parsimony(material, surface, points.uv, valid, scale, shift, options)
             loss = loss + options.slope_small * dr.mean(dr.select(valid, dr.squared_norm(slope), 0))
             if light.anchor > 0:
                 pull = dr.opaque(mi.Float, light.anchor * 0.1 ** (i / (light.lambda_a * options.steps)))
@@ -237,14 +235,6 @@ def exchange_scale(adam: Adam, material: MaterialField, colour_gradient, gain_gr
     project(material)
     dr.eval(material.colour)
     return move.astype(np.float32)
-
-
-def residuals(a, b, target, saturated: float):
-    """Per point: mean over channels of display_weight (a - L*)(b - L*), unbiased for the squared error. A pixel from
-    `saturated` on only says "at least this bright"."""
-    value = (a - target) * (b - target) * display_weight(target)
-    value = dr.select((target >= saturated) & (dr.detach((a + b) * 0.5) > target), 0, value)
-    return (value.x + value.y + value.z) / 3
 
 
 def _watch(model: CollectionSurface, each, valid, view, running, i: int, steps: int) -> np.ndarray:

@@ -28,7 +28,6 @@ from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.instance_search import Search
 from relit.fit.instances import ANOTHER_PHOTO, View, carved, hold_distances, move_poses, moved_poses, pixel_bank
-from relit.fit.multiview import run_arrays, vertex_areas
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import (
@@ -47,12 +46,13 @@ from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_s
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.mesh import extract_mesh
+from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 
 __all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
@@ -225,7 +225,7 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         standing = [np.linalg.inv(p) for p in parts["poses"]]
         middle = np.mean([s[:3, 3] for s in standing], 0)
         scene_from_photo = similarity(turn, -turn @ middle)
-        ground_level = ground_colour(pixels, camera, parts["plane"])
+        ground_level = ground_colour(pixels, parts["plane"])
         moves = spread(standing, scene_from_photo) if "visibility" in options.without else None
         whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, moves)
         numbers = np.flatnonzero(parts["related"])
@@ -246,7 +246,7 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         level = float((parts["radiance"].mean(0) * areas[:, None]).sum() / areas.sum() / 3)
         traced, metallic, roughness = TraceableMesh(whole, radiance), PAINT, None
         if options.first_material and stage.load("checkpoint") is None:
-            metallic, roughness = first_material(bank, traced, start, known, level, None, o, seed)
+            metallic, roughness = first_material(bank, traced, start, known, level, None, o, seed, run.progress("metal or paint"))
             run.say(describe(metallic, roughness, known))
         model = start_surface(start, known, level, o, None, metallic, roughness)
         if options.gaussians:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from relit.cameras.matcher import STEP
-from relit.errors import UserError, did_you_mean
 from relit.lighting.spherical_gaussians import MAX_LOBES
+from relit.settings import check_parts, preset
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,7 @@ class DuplicatesOptions:
             raise ValueError(f"gaussians={self.gaussians} is outside 0 to {MAX_LOBES}")
         if not 1 <= self.matcher_step <= 90 or 360 % self.matcher_step:
             raise ValueError(f"matcher_step={self.matcher_step} is no divisor of 360 from 1 to 90")
-        for name in self.without:
-            if name not in WITHOUT:
-                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+        check_parts(self.without, WITHOUT)
 
 
 WITHOUT = {
@@ -85,6 +83,4 @@ PRESETS = {
 
 def options_for(quality: str) -> DuplicatesOptions:
     """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
-    if quality not in PRESETS:
-        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
-    return DuplicatesOptions(**PRESETS[quality])
+    return DuplicatesOptions(**preset(quality, PRESETS))

@@ -17,6 +17,7 @@ from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instance_growth import seen_from
 from relit.fit.instance_search import Search, ambiguous, place
 from relit.fit.instances import COARSE, View, carved, views_of
+from relit.run import run_arrays
 from relit.scene import Camera, Pixels
 
 FAR = 45.0  # degrees between what an object shows and what the next one does from which on the search is often wrong
@@ -37,8 +38,6 @@ def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[
 def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
     """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,), unsure (N,) degrees) of all views, in the unit frame of the
     object. unsure: see `instance_search.ambiguous`."""
-    from relit.fit.multiview import run_arrays
-
     if run.done("poses"):
         saved = run_arrays(run, "poses", "poses")
         unsure = saved.get("unsure", np.zeros(len(saved["labels"])))

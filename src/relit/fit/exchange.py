@@ -29,11 +29,13 @@ class Exchange:
         """normals: (S, S, 3) unit normal of each of `texels` = S² texels; None where a texel stands in many places and faces all sides."""
         self.count, self.light_rows = 2 * hats * hats, light_rows
         d = environment_directions(ROWS, 2 * ROWS).reshape(-1, 3)
-        self._cosines = np.maximum(d @ d.T, 0) * environment_solid_angles(ROWS, 2 * ROWS).reshape(-1)
+        cosines = np.maximum(d @ d.T, 0) * environment_solid_angles(ROWS, 2 * ROWS).reshape(-1)
         if normals is None:
-            self._cosines[:] = environment_solid_angles(ROWS, 2 * ROWS).reshape(-1)
+            cosines[:] = environment_solid_angles(ROWS, 2 * ROWS).reshape(-1)
             normals = np.tile([0.0, 1.0, 0.0], (texels, 1))
-        self._hats = hat_weights(ROWS, hats)
+        self._cosines = mi.Float(cosines.astype(np.float32).ravel())
+        self._hats = mi.Float(hat_weights(ROWS, hats).astype(np.float32).ravel())
+        self._shrink = area_means(light_rows)
         n = normals.reshape(-1, 3)
         u = np.arctan2(n[:, 0], -n[:, 2]) / (2 * np.pi)
         v = np.arccos(np.clip(n[:, 1], -1, 1)) / np.pi
@@ -43,11 +45,14 @@ class Exchange:
         self.adam = Adam(3 * self.count)
         self.share = None
 
-    def refresh(self, radiance: np.ndarray) -> None:
-        """Follow the light (rows, 2 rows, 3)."""
-        light = cv2.resize(radiance.mean(-1), (2 * ROWS, ROWS), interpolation=cv2.INTER_AREA).ravel() + 1e-6
-        share = (self._cosines * light) @ self._hats / (self._cosines @ light)[:, None]
-        self.share = mi.Float(share.astype(np.float32).ravel())
+    def refresh(self, radiance) -> None:
+        """Follow the light, Float [rows * 2 rows * 3]."""
+        texel, weight = self._shrink
+        c = dr.gather(mi.Color3f, dr.detach(radiance), texel)
+        light = dr.block_sum((c.x + c.y + c.z) * weight, dr.width(texel) // (2 * ROWS * ROWS)) / 3 + 1e-6
+        dr.eval(light)
+        self.share = shares(self._cosines, self._hats, light, self.count)
+        dr.eval(self.share)
 
     def step(self, colour, log_light, colour_gradient, light_gradient, rate: float, metallic=None):
         """(colour, log_light) after one step. colour: Float [S² · 4] base colour and roughness; log_light: Float [rows · 2 rows · 3];
@@ -79,6 +84,34 @@ class Exchange:
         factor = dr.gather(mi.Color3f, dr.exp(-dr.block_sum(terms, n)), self.bin)
         whole = whole * factor - besides
         return dr.ravel(mi.Vector4f(whole.x, whole.y, whole.z, base.w)), log_light
+
+
+@dr.syntax
+def shares(cosines, hats, light, count):
+    """ψ_k(n), Float [normals * count], for the light (Float, a value for each direction of the table). cosines: Float [normals *
+    directions], hats: Float [directions * count]. Each lane sums over the directions: no larger array is made, and none leaves the
+    device."""
+    bins = 2 * ROWS * ROWS
+    lane = dr.arange(mi.UInt32, bins * count)
+    first, k = (lane // count) * bins, lane % count
+    j, part, whole = mi.UInt32(0), mi.Float(0), mi.Float(0)
+    while j < bins:
+        w = dr.gather(mi.Float, cosines, first + j) * dr.gather(mi.Float, light, j)
+        part += w * dr.gather(mi.Float, hats, j * count + k)
+        whole += w
+        j += 1
+    return part / whole
+
+
+def area_means(rows: int):
+    """How a lat-long map of `rows` is brought to ROWS, each texel the mean over its area (OpenCV's INTER_AREA): (index UInt32, weight
+    Float), as many entries for each of the ROWS * 2 ROWS texels."""
+    along = [cv2.resize(np.eye(n), (n, m), interpolation=cv2.INTER_AREA) for n, m in ((rows, ROWS), (2 * rows, 2 * ROWS))]  # (m, n) each
+    used = [np.argsort(a == 0, axis=1, kind="stable")[:, : (a != 0).sum(1).max()] for a in along]  # zeros fill up
+    weights = [np.take_along_axis(a, u, 1) for a, u in zip(along, used, strict=True)]
+    index = used[0][:, None, :, None] * 2 * rows + used[1][None, :, None, :]
+    weight = weights[0][:, None, :, None] * weights[1][None, :, None, :]
+    return mi.UInt32(index.astype(np.uint32).ravel()), mi.Float(weight.astype(np.float32).ravel())
 
 
 def mirrored(roughness):

@@ -9,6 +9,7 @@ better.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -18,7 +19,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
 from relit.fit.loop import NoStage
-from relit.fit.pixels import PixelBank
+from relit.fit.pixels import PixelBank, saturated_at
 from relit.fit.surface import SurfaceModel, SurfaceOptions, drawn_points, dual_values, fit_surface, start_surface
 from relit.materials.field import material_at
 from relit.rendering.transport import TraceableMesh, reflected, sample_lights
@@ -41,22 +42,32 @@ TRIAL = {  # of the short fits
     "metallic_sparse": 0.003,
     "metallic_binary": 0.003,
 }
-EXCHANGE_RATE = 0.02  # at most
+MOST_EXCHANGE = 0.02  # of exchange_rate
 BATCHES = 8  # of pixels that the fits are judged by
 
 
 def first_material(
-    bank: PixelBank, mesh: TraceableMesh, base: np.ndarray, known: np.ndarray, radiance: float, normals, options: SurfaceOptions, seed=0
+    bank: PixelBank,
+    mesh: TraceableMesh,
+    base: np.ndarray,
+    known: np.ndarray,
+    radiance: float,
+    normals,
+    options: SurfaceOptions,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Metallic and roughness to begin with, (S, S) float32 each. base, known, radiance, normals: as of `start_surface`."""
-    o = replace(options, steps=min(STEPS, options.steps // 2), exchange_rate=min(options.exchange_rate, EXCHANGE_RATE), **TRIAL)
+    """Metallic and roughness to begin with, (S, S) float32 each. base, known, radiance, normals: as of `start_surface`.
+    progress: told how many steps of all short fits are over."""
+    stage = NoStage(progress)
+    o = replace(options, steps=min(STEPS, options.steps // 2), exchange_rate=min(options.exchange_rate, MOST_EXCHANGE), **TRIAL)
     given = (base, known) if normals is None else (base, known, normals)
     small = [cv2.resize(np.asarray(a, np.float32), (TEXTURE, TEXTURE), interpolation=cv2.INTER_AREA) for a in given]
     fits = []
     for metallic, roughness in SIDES:
         first = o if roughness is None else replace(o, roughness_start=roughness)
         model = start_surface(small[0], small[1] > 0.5, radiance, first, None if normals is None else small[2], metallic)
-        fits.append(fit_surface(bank, mesh, model, o, NoStage(), seed))
+        fits.append(fit_surface(bank, mesh, model, o, stage, seed))
     colour = np.sqrt(np.maximum(base, 0) / max(float(base[known].mean()), 1e-6))
     centres, group = groups_of(colour, known)
     paint, metal, dull = (errors(bank, mesh, f, o, centres, colour, seed) for f in fits)
@@ -91,7 +102,7 @@ def errors(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, o: Surface
         dr.eval(surface.base, surface.roughness, surface.metallic)
         lights = sample_lights(mesh, points, surface, model.environment, o.directions, rng)
         a, b = reflected(points, lights, surface, model.environment)
-        value = dual_values(a, b, batch.rgb, bank.saturated)
+        value = dual_values(a, b, batch.rgb, saturated_at(bank, batch.view))
         keep = np.array(points.valid)
         uv = np.clip((np.array(points.uv).T * size).astype(int), 0, size - 1)[keep]
         group = vq(colour[uv[:, 1], uv[:, 0]], centres)[0]

@@ -14,22 +14,24 @@ settle: it is set so that the brightest diffuse albedo is BRIGHTEST.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 
-from relit.conventions import move_points, similarity
-from relit.errors import UserError, did_you_mean
+from relit.capture.photo import layers
+from relit.errors import UserError
 from relit.fit.flash_ambient import find_ambient
 from relit.fit.flash_dino import DinoNetwork, network_file
 from relit.fit.flash_features import FlashView, capture_features, network_features
 from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
 from relit.fit.hollows import HollowOptions, open_hollows, without
 from relit.fit.kinship import start_kinship
-from relit.fit.multiview import load_pixels, rotation_from_y, run_arrays, score_held_out
+from relit.fit.load_photos import load_pixels
+from relit.fit.multiview import score_held_out
 from relit.fit.outlines import follow_outlines
-from relit.fit.pixels import SATURATED, PixelBank
+from relit.fit.pixels import PixelBank
+from relit.fit.placing import placed_mesh
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -43,7 +45,9 @@ from relit.materials.rough_plastic import IOR, Coat
 from relit.rendering.shade import features_at
 from relit.rendering.shade_flash import FlashAppearance, alpha_on, start_learnt
 from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
+from relit.settings import check_parts, preset
 
 LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
@@ -93,9 +97,7 @@ class FlashOptions:
     def __post_init__(self):
         if self.directions < 0 or self.bounces < 1:
             raise ValueError("directions must be at least 0 and bounces at least 1")
-        for name in self.without:
-            if name not in WITHOUT:
-                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+        check_parts(self.without, WITHOUT)
 
 
 WITHOUT = ("offset", "shadow", "interreflection", "features", "refinement")
@@ -121,12 +123,10 @@ PRESETS = {
 
 def options_for(quality: str) -> FlashOptions:
     """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
-    if quality not in PRESETS:
-        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
-    return FlashOptions(**PRESETS[quality])
+    return FlashOptions(**preset(quality, PRESETS))
 
 
-def surface_options(o: FlashOptions, saturated: float) -> FlashSurfaceOptions:
+def surface_options(o: FlashOptions) -> FlashSurfaceOptions:
     off = {}
     if "offset" in o.without:
         off["offset_rate"] = 0.0
@@ -135,8 +135,7 @@ def surface_options(o: FlashOptions, saturated: float) -> FlashSurfaceOptions:
     directions = 0 if "interreflection" in o.without else o.directions
     share = {"smooth": o.smooth} if "features" not in o.without else {"smooth": 0.0}
     shadow = "shadow" not in o.without
-    common = {"saturated": saturated, "patches": o.patches}
-    return FlashSurfaceOptions(o.surface_steps, o.points, directions, o.bounces, shadow, **common, **off, **share)
+    return FlashSurfaceOptions(o.surface_steps, o.points, directions, o.bounces, shadow, patches=o.patches, **off, **share)
 
 
 def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> Asset:
@@ -145,11 +144,10 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
         raise ValueError("reconstruct needs cameras and the object sphere")
     if len(options.levels) != len(options.level_steps):
         raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
-    world_from_unit = capture.sphere.world_from_unit
     check_backdrop(capture)
     bank, cameras, masks, level = load_pixels(capture, options, run)
     check_photos(bank, cameras, masks, level)
-    bank.saturated = bank.ignored = saturation(capture)
+    bank.drop_saturated = True
     coat = Coat(options.ior)
     if options.dino and not run.done("surface"):
         DinoNetwork(network_file(options.dino))  # what is wrong with it is told before anything is computed
@@ -163,18 +161,13 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
     else:
-        maps = surface_stage(bank, cameras, mesh, parts, coat, bank.saturated, run, options, seed)
-    return assemble(capture, mesh, maps, world_from_unit, options.ior)
-
-
-def saturation(capture: Capture) -> float:
-    """The linear value from which on a pixel may be over-exposed: photos in EXR or HDR are not clipped."""
-    return np.inf if all(p.name.lower().endswith((".exr", ".hdr")) for p in capture.photos) else SATURATED
+        maps = surface_stage(bank, cameras, mesh, parts, coat, run, options, seed)
+    return assemble(capture, mesh, maps, options.ior)
 
 
 def check_backdrop(capture: Capture) -> None:
     """Raises UserError where the masks were found before a plain backdrop that is not dark: other light than the flash falls on it."""
-    backdrops = [p.load.mask for p in capture.photos if isinstance(getattr(p.load, "mask", None), Backdrop)]
+    backdrops = [m for p in capture.photos for layer in layers(p.load) if isinstance(m := getattr(layer, "mask", None), Backdrop)]
     if sum(not b.dark for b in backdrops) > len(capture.photos) / 2:
         raise UserError(
             "the surroundings are not dark: the photos stand before a bright, even backdrop",
@@ -205,7 +198,8 @@ def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarra
         )
     rgbm = np.array(bank.rgbm).reshape(-1, 4)
     inside = rgbm[rgbm[:, 3] > 0.99][::7, :3]
-    burnt = float((inside.min(1) >= 0.99).mean()) if len(inside) else 0.0
+    ends = np.repeat(np.broadcast_to(np.array(bank.saturated), bank.views), np.diff([*np.array(bank.offsets), bank.total]))
+    burnt = float((inside.min(1) >= ends[rgbm[:, 3] > 0.99][::7]).mean()) if len(inside) else 0.0
     if burnt > 0.5:
         raise UserError(
             f"{100 * burnt:.0f} % of the object's pixels are over-exposed",
@@ -243,7 +237,8 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
         if options.hollows > 0 and not stage.load("checkpoint"):
             o = HollowOptions(options.hollows)
             coarse = visual_hull(cameras, masks, o.nodes)
-            values = without(values, open_hollows(bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed))
+            show = run.progress("hollows that no silhouette shows")
+            values = without(values, open_hollows(bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed, show))
         model = start(values, False)
         mirrors = options.directions > 0 and "interreflection" not in options.without
         shadow = "shadow" not in options.without
@@ -295,9 +290,9 @@ def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: F
     return parts
 
 
-def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, saturated: float, run, options: FlashOptions, seed: int):
+def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, run, options: FlashOptions, seed: int):
     """Material and flash. Returns (and keeps) diffuse, specular, alpha, normal, offset and intensity (unit frame)."""
-    o = surface_options(options, saturated)
+    o = surface_options(options)
     network = DinoNetwork(network_file(options.dino)) if options.dino else None
     with run.stage("surface", steps=o.steps, title="material and flash (surface pass)") as stage:
         face, bary = rasterise_atlas(mesh, options.texture)
@@ -338,17 +333,9 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, satur
     return maps
 
 
-def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_from_unit: np.ndarray, ior: float) -> Asset:
-    """The asset: +Y up where the capture knows its up direction; lengths in the units of the user's cameras."""
-    up = np.array([0.0, 1.0, 0.0]) if capture.up is None else np.asarray(capture.up, np.float64)
-    world_from_asset = similarity(rotation_from_y(up), capture.sphere.centre)
-    asset_from_unit = np.linalg.inv(world_from_asset) @ world_from_unit
-    radius = float(np.cbrt(np.linalg.det(asset_from_unit[:3, :3])))
-    placed = replace(
-        mesh,
-        vertices=move_points(asset_from_unit, mesh.vertices).astype(np.float32),
-        normals=(mesh.normals @ (asset_from_unit[:3, :3] / radius).T).astype(np.float32),
-    )
+def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], ior: float) -> Asset:
+    """The asset in the frame of the user's cameras (`placed_mesh`)."""
+    (placed, world_from_asset), radius = placed_mesh(capture, mesh), capture.sphere.radius
     roughness = np.sqrt(maps["alpha"])
     base = base_colour(maps["diffuse"], roughness, maps["specular"], ior)
     metallic = np.zeros((1, 1), np.float32)

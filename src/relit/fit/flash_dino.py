@@ -14,11 +14,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from relit.capture.networks import Network, first_line
 from relit.conventions import srgb_from_linear
 from relit.errors import EXIT_ENVIRONMENT, UserError
 from relit.scene import Camera
 
-MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's
 ENLARGED = 2
 MULTIPLE = 112  # sides are multiples of it: of 8, 14 and 16, the patches of the common networks
 LARGEST = 896  # side, in pixels: the cost grows with its fourth power
@@ -31,37 +31,22 @@ class DinoNetwork:
     """The network in memory. Raises UserError for files that OpenCV cannot read."""
 
     def __init__(self, file: str | Path):
-        path = Path(file)
-        if not path.is_file():
-            raise UserError(f"no network at: {path}", fix="give the path of an ONNX file as the setting `dino`, or leave it out")
-        try:
-            self.net = cv2.dnn.readNetFromONNX(str(path))
-        except cv2.error as error:
-            raise UserError("the network cannot be read", _first_line(error), f"give an ONNX file of a DINO network: {path}") from None
-        self.path = path
+        self.network = Network(file)
 
     def features(self, rgb: np.ndarray) -> np.ndarray:
         """(H, W, 3) linear -> (h, w, C) float32, one row and column for each patch."""
         side = ENLARGED * max(rgb.shape[:2])
         side = int(np.clip(round(side / MULTIPLE) * MULTIPLE, MULTIPLE, LARGEST))
         shown = cv2.resize(np.clip(srgb_from_linear(rgb), 0, 1).astype(np.float32), (side, side), interpolation=cv2.INTER_CUBIC)
-        blob = ((shown - np.float32(MEAN)) / np.float32(SPREAD)).transpose(2, 0, 1)[None]
-        try:
-            self.net.setInput(np.ascontiguousarray(blob, np.float32))
-            out = np.asarray(self.net.forward())
-        except cv2.error as error:
-            raise UserError(
-                f"the network does not take a picture of {side} x {side}", _first_line(error), f"export it with free sides: {self.path}"
-            ) from None
-        return token_map(out, self.path)
+        out = self.network.run(shown)
+        tokens = token_map(out)
+        if tokens is None:
+            raise self.network.strange(out, "tokens (1, 1 + P, C) of a square picture or a map (1, C, h, w)")
+        return tokens
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:200]
-
-
-def token_map(out: np.ndarray, name) -> np.ndarray:
-    """The network's output as (h, w, C): tokens of a square picture, or a map as it is. Raises UserError for other shapes."""
+def token_map(out: np.ndarray) -> np.ndarray | None:
+    """The network's output as (h, w, C): tokens of a square picture, or a map as it is. None for other shapes."""
     if out.ndim == 4 and out.shape[0] == 1:
         return out[0].transpose(1, 2, 0)
     if out.ndim == 3 and out.shape[0] == 1:
@@ -69,10 +54,7 @@ def token_map(out: np.ndarray, name) -> np.ndarray:
             h = round(np.sqrt(max(out.shape[1] - first, 0)))
             if h > 0 and h * h == out.shape[1] - first:
                 return out[0, first:].reshape(h, h, -1)
-    shape = " x ".join(str(s) for s in out.shape)
-    raise UserError(
-        f"the network's output is {shape}", "tokens (1, 1 + P, C) of a square picture or a map (1, C, h, w) are looked for", f"see: {name}"
-    )
+    return None
 
 
 def network_file(setting: str) -> Path:
@@ -95,7 +77,7 @@ def network_file(setting: str) -> Path:
         return Path(hf_hub_download("/".join(parts[:2]), "/".join(parts[2:])))
     except Exception as error:  # whatever the client raises without a network or for a name that is not there
         raise UserError(
-            f"'{setting}' could not be fetched", _first_line(error), "give the path of an ONNX file", code=EXIT_ENVIRONMENT
+            f"'{setting}' could not be fetched", first_line(error), "give the path of an ONNX file", code=EXIT_ENVIRONMENT
         ) from None
 
 

@@ -1,7 +1,8 @@
 """The surface pass of flash captures: rough-plastic textures, a normal map, and the flash itself, on a fixed mesh.
 
 Each step takes some thousand pixels of all photos. Direct light is exact; inter-reflection is estimated twice and
-independently, so that the product of the two residuals is unbiased for the squared error (rendering/transport_flash.py).
+independently, so that the product of the two residuals is unbiased for the squared error (rendering/transport_flash.py). An over-exposed
+pixel has no say over lobes and patches, and none over a texel that is brighter yet.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from relit.fit.flash_patches import draw_patches, pyramid_loss, ssim_loss
 from relit.fit.kinship import Kinship, share_evidence
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight
-from relit.fit.pixels import PixelBank, batch_of, draw_pixels, well_exposed
+from relit.fit.pixels import PixelBank, draw_pixels, saturated_at, well_exposed
 from relit.fit.preview import surface_preview
-from relit.fit.surface import neighbours
+from relit.fit.surface import drawn_points, dual_values, neighbours
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import PlasticField, plastic_at, project
 from relit.materials.rough_plastic import Coat, Plastic
-from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits
+from relit.rendering.transport import Points, TraceableMesh, bent_normal
 from relit.rendering.transport_flash import direct, indirect, lit
 
 
@@ -40,8 +41,6 @@ class FlashSurfaceOptions:
     between neighbours up to reach apart, of like features (to about width). share: length of the like places' common step
     (fit/kinship.py), taken every share_every steps; own: part of what a texel has to itself that is kept per step.
     slope_*: the normal map (see SurfaceOptions of fit/surface.py). offset_z: weight of |Δo_z|. alpha_range: of alpha beyond .5.
-    saturated: linear value from which on a pixel is over-exposed: it has no say over lobes and patches then, and none over a texel that is
-    brighter yet.
     patches: weight of the Gaussian-pyramid and SSIM terms of PIR Eq. 9; pixels are then drawn in patches (fit/flash_patches.py).
     """
 
@@ -72,7 +71,6 @@ class FlashSurfaceOptions:
     slope_calm: float = 0.1
     offset_z: float = 0.002
     alpha_range: float = 0.1
-    saturated: float = 0.99
     patches: float = 0.0
 
 
@@ -111,14 +109,9 @@ def fit_flash_surface(
 
     def step(i: int) -> dict:
         decay = cosine_decay(i / o.steps, 0.03)
-        pixel = draw_patches(bank, rng, o.points) if o.patches > 0 else draw_pixels(bank, rng, o.points)
-        dr.eval(pixel, rng)
-        batch = batch_of(bank, pixel)
-        points = first_hits(mesh, batch.o, batch.d)
-        valid = points.valid & (batch.mask > 0.99) & (dr.dot(points.n, points.v) > 0.1)
-        points.valid = valid
-        calm = dr.gather(mi.Float, even, pixel)
-        dr.eval(points, batch.rgb, batch.view, calm)
+        batch, points = drawn_points(bank, mesh, rng, o.points, draw_patches if o.patches > 0 else draw_pixels)
+        valid, calm = points.valid, dr.gather(mi.Float, even, batch.pixel)
+        dr.eval(batch.view, calm)
         near = neighbours(mesh, points, o.reach, rng)
         close = neighbours(mesh, points, o.slope_reach, rng)
         dr.eval(near, close, rng)
@@ -139,9 +132,10 @@ def fit_flash_surface(
             a, b = (straight + bounced(mesh, field, model, points, plastic, n, position, intensity, rng, o) for _ in range(2))
         e = min(1.5 * i / o.steps, 1.0)
         sigma = dr.opaque(mi.Float, o.robust[0] ** (1 - e) * o.robust[1] ** e)
-        fit = robust_loss(a, b, batch.rgb, valid, calm, sigma, o.saturated)
+        saturated = saturated_at(bank, batch.view)
+        fit = robust_loss(a, b, batch.rgb, valid, calm, sigma, saturated)
         if o.patches > 0:
-            counts = valid & well_exposed(batch.rgb, o.saturated)
+            counts = valid & well_exposed(batch.rgb, saturated)
             alike = pyramid_loss(a, b, batch.rgb, dr.select(counts, calm, 0)) + ssim_loss(a, b, batch.rgb, counts)
             fit += dr.opaque(mi.Float, o.patches) * alike
         bend = slope.x * points.t + slope.y * points.b
@@ -166,16 +160,16 @@ def fit_flash_surface(
                 keep = 1 - (1 - model.kinship.own(o.own)) * dr.opaque(mi.Float, decay)
                 field.lobe = common + keep * (field.lobe - common)
                 if i % (o.share_every if 20 * i > o.steps else 2) == 0:
-                    share(i, points, batch, plastic, n, position, intensity, seen, (a + b) * 0.5 - straight, calm, sigma, decay)
+                    share(points, batch, plastic, n, position, intensity, seen, (a + b) * 0.5 - straight, calm, sigma, decay)
         project(field)
         dr.eval(model.offset, model.log_intensity, field.diffuse, field.lobe, field.slope)
         return {"colour": fit}
 
-    def share(i, points, batch, plastic, n, position, intensity, seen, bounce, calm, sigma, decay):
+    def share(points, batch, plastic, n, position, intensity, seen, bounce, calm, sigma, decay):
         n, position, intensity, bounce, plastic = (dr.detach(v) for v in (n, position, intensity, bounce, plastic))
         photo = batch.rgb - bounce
         now = direct(points, plastic, model.coat, n, position, intensity, seen)
-        counts = points.valid & well_exposed(batch.rgb, o.saturated)
+        counts = points.valid & well_exposed(batch.rgb, saturated_at(bank, batch.view))
         weight = display_weight(batch.rgb) * dr.select(counts, calm * robust_weight(now - photo, batch.rgb, sigma), 0)
         dr.eval(n, position, intensity, photo, weight, plastic)
         shade = lambda p: direct(points, p, model.coat, n, position, intensity, seen)  # noqa: E731
@@ -224,15 +218,13 @@ def calm_weights(bank: PixelBank, cameras, edge: float):
     return mi.Float(np.concatenate(weights))
 
 
-def robust_loss(a, b, target, valid, calm, sigma, saturated: float):
+def robust_loss(a, b, target, valid, calm, sigma, saturated):
     """Mean of w (a - L*)(b - L*) with w of the photo, less where both estimates are far off (Geman & McClure's weight, detached).
 
     sigma: opaque Float, display value where it is a quarter. A saturated pixel says only "at least this bright".
     """
-    value = (a - target) * (b - target) * display_weight(target)
     mean = dr.detach((a + b) * 0.5)
-    value = dr.select((target >= saturated) & (mean > target), 0, value)
-    value = (value.x + value.y + value.z) / 3 * calm * robust_weight(mean - target, target, sigma)
+    value = dual_values(a, b, target, saturated) * calm * robust_weight(mean - target, target, sigma)
     return dr.sum(dr.select(valid, value, 0)) / dr.maximum(dr.sum(dr.select(valid, mi.Float(1), 0)), 1)
 
 

@@ -60,17 +60,19 @@ def open_hollows(
     options: HollowOptions,
     say: Callable[[str], None],
     seed: int = 0,
+    progress: Callable[[int], None] | None = None,
 ) -> np.ndarray | None:
     """What is to be taken away from a visual hull: (n, n, n) distances, negative in the hollows, or None where there are none.
 
     values: (n, n, n) distances of the hull, n = options.nodes. cameras: unit frame. start: distances -> a fresh model of the capture kind.
+    progress: told how many steps of all trials are over.
     """
+    stage = NoStage(progress)
     o, hull = options, values < 0
     some = cameras[:: max(1, len(cameras) // 40)]
 
     def fitted(v: np.ndarray):
-        model = start(v)
-        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), NoStage(), seed)
+        model = briefly_fitted(bank, start(v), o, stage, seed)
         return dense_values(model.grid), *surface_error(bank, model, o, seed)
 
     shape, error, where = fitted(values)
@@ -85,6 +87,11 @@ def open_hollows(
         values, (shape, error, where) = trial, new
     gone = hull & (values >= 0)
     return distance_of(gone) if gone.any() else None
+
+
+def briefly_fitted(bank: PixelBank, model: VolumeModel, o: HollowOptions, stage, seed: int) -> VolumeModel:
+    """The model after a trial's steps."""
+    return fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), stage, seed)
 
 
 def without(values: np.ndarray, hollows: np.ndarray | None) -> np.ndarray:
@@ -117,7 +124,7 @@ def ray_errors(bank: PixelBank, model: VolumeModel, count: int, seed: int):
         r = dr.square(colour - batch.rgb) * display_weight(batch.rgb)
         value = (r.x + r.y + r.z) / 3
         hit = (m.opacity > 0.5) & (batch.mask > 0.99) & dr.isfinite(value)
-        x = batch.o + batch.d * (m.depth / dr.maximum(m.opacity, 0.05))
+        x = m.surface_point(batch.o, batch.d)
         return np.array(value), np.array(hit), np.array(x).T
 
 

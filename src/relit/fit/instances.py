@@ -135,15 +135,20 @@ def first_pose(view: View, distance: float) -> np.ndarray:
     return similarity(np.eye(3), -distance * ray)
 
 
+def nearest_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows (N,) of the pixels that show points (N, 3), or of the nearest ones at the border; and whether they show them."""
+    q = camera.project(points)
+    u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
+    ok = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height) & (q[:, 2] > 0)
+    return np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1), ok
+
+
 def inflated(view: View, pose: np.ndarray, n: int, depth: float = 1.2, most: float = 0.55) -> np.ndarray:
     """Signed distance (n, n, n) of a body that fills the silhouette, as deep on both sides as `depth` times the distance to the outline."""
     camera = view.camera.with_pose(pose)
     solid = view.mask > 0.5
     p = node_positions(n).reshape(-1, 3)
-    q = camera.project(p)
-    u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
-    ok = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height) & (q[:, 2] > 0)
-    u, v = np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1)
+    u, v, ok = nearest_pixels(camera, p)
     middle = float(np.linalg.norm(camera.centre))
     room = distance_transform_edt(np.pad(solid, 1))[1:-1, 1:-1] / camera.fx * middle
     along = p @ (camera.centre / middle)
@@ -167,10 +172,7 @@ def carved(
     across = crossed & (np.abs(seen @ seen.T).min(1) < np.cos(np.radians(ACROSS)))
     for view, pose, bounded in zip(views, poses, across, strict=True):
         camera = view.camera.with_pose(pose)
-        q = camera.project(p)
-        u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
-        ok = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height) & (q[:, 2] > 0)
-        u, v = np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1)
+        u, v, ok = nearest_pixels(camera, p)
         known = view.known[v, u] > 0.5  # beyond the window: as at its edge
         out = ~(ok & (view.mask[v, u] > 0.3))
         if depth is not None and not bounded:

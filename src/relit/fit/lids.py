@@ -13,10 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label, uniform_filter
 
-from relit.fit.hollows import HollowOptions, left_without, nearest_node, ray_errors, skin_of
+from relit.fit.hollows import HollowOptions, briefly_fitted, left_without, nearest_node, ray_errors, skin_of
 from relit.fit.loop import NoStage
 from relit.fit.pixels import PixelBank
-from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.fit.volume import VolumeModel
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions, resample
 from relit.scene import Camera
@@ -40,21 +40,20 @@ def open_lids(
     faces: int = 3,
     first: HollowOptions = FIRST,
     then: HollowOptions = THEN,
+    progress: Callable[[int], None] | None = None,
 ) -> np.ndarray | None:
     """What is to be taken away from a visual hull: (n, n, n) distances, negative in the hollows, or None where there are none.
 
     values: (n, n, n) distances of the hull, n = first.nodes. cameras: unit frame. start: distances -> a fresh model of the capture kind.
-    faces: how many are asked, the largest first.
+    faces: how many are asked, the largest first. progress: told how many steps of all trials are over.
     """
     if len(cameras) < PHOTOS:
         return None
-    hull = values < 0
+    stage, whole, hull = NoStage(progress), values, values < 0
     some = cameras[:: max(1, len(cameras) // 40)]
 
     def errors(v: np.ndarray, o: HollowOptions):
-        model = start(v)
-        fit_volume(bank, model, VolumeOptions((o.nodes,), (o.steps,), o.rays, sharpness=o.sharpness), NoStage(), seed)
-        return ray_errors(bank, model, o.probes, seed)
+        return ray_errors(bank, briefly_fitted(bank, start(v), o, stage, seed), o.probes, seed)
 
     known: dict[int, tuple] = {}  # errors of the shape as it is, by nodes
 
@@ -70,9 +69,9 @@ def open_lids(
         found = errors(new, o)
         return max(f(found[0][rays]) / max(f(value[rays]), 1e-12) for f in (np.mean, np.median)), found
 
-    mouths = [(lid, found[1].sum()) for lid in flat_faces(values) if (found := opened_at(hull, lid, some, first))]
-    for lid, _ in sorted(mouths, key=lambda pair: -pair[1])[:faces]:
-        opened = opened_at(values < 0, lid, some, first)
+    asked = [(lid, found) for lid in flat_faces(values) if (found := opened_at(hull, lid, some, first))]
+    for lid, found in sorted(asked, key=lambda pair: -pair[1][1].sum())[:faces]:
+        opened = found if values is whole else opened_at(values < 0, lid, some, first)
         if opened is None:
             continue
         gain, coarse = change(*opened, first)

@@ -11,34 +11,38 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from relit.cameras.se3 import align_cameras, nearest_rotation
-from relit.conventions import move_points, move_pose, similarity, srgb_from_linear
-from relit.errors import UserError, did_you_mean
+from relit.conventions import move_points, move_pose, srgb_from_linear
+from relit.errors import UserError
 from relit.files import write_text
 from relit.fit.explore import explore, first_shape
 from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.hollows import without
 from relit.fit.lids import FIRST, open_lids
+from relit.fit.load_photos import load_pixels
 from relit.fit.outlines import follow_outlines
-from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras, sphere_pixels
+from relit.fit.pixels import PixelBank, corrected, place_cameras, sphere_pixels
+from relit.fit.placing import placed_mesh
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import visual_hull
-from relit.geometry.mesh import extract_mesh
+from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.materials.field import normal_map, pictures
 from relit.materials.intrinsic import base_without_shading
 from relit.rendering.background import start_background
 from relit.rendering.shade import mean_radiance
 from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
+from relit.settings import check_parts, preset
 
 LIGHT = "one fixed light is assumed (multiview)"  # what `relit inspect` says
 STAGES = ("volume", "mesh", "surface")
@@ -76,9 +80,7 @@ class MultiviewOptions:
     without: tuple[str, ...] = ()
 
     def __post_init__(self):
-        for name in self.without:
-            if name not in WITHOUT:
-                raise ValueError(f"without={name} is not known.{did_you_mean(name, WITHOUT)} Known: {', '.join(WITHOUT)}")
+        check_parts(self.without, WITHOUT)
 
 
 SMOOTH_COLOUR = 0.1  # of SurfaceOptions: here many photos see each place under one light
@@ -132,9 +134,7 @@ PRESETS = {
 
 def options_for(quality: str) -> MultiviewOptions:
     """The recipe's options for 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
-    if quality not in PRESETS:
-        raise UserError(f"quality '{quality}' is not known.{did_you_mean(quality, PRESETS)}", fix=f"one of: {', '.join(PRESETS)}", code=2)
-    return MultiviewOptions(**PRESETS[quality])
+    return MultiviewOptions(**preset(quality, PRESETS))
 
 
 def volume_options(o: MultiviewOptions) -> VolumeOptions:
@@ -154,7 +154,6 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
         raise ValueError("reconstruct needs cameras and the object sphere")
     if len(options.levels) != len(options.level_steps):
         raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
-    world_from_unit = capture.sphere.world_from_unit
     bank, cameras, masks, level = load_pixels(capture, options, run)
 
     if run.done("mesh"):
@@ -170,8 +169,8 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
         maps = run_arrays(run, "surface", "maps")
     else:
         maps = surface_stage(bank, mesh, parts["radiance"], run, options, seed)
-    poses = [move_pose(world_from_unit, c.world_from_camera) for c in cameras] if options.refine_cameras > 0 else None
-    return assemble(capture, mesh, maps, world_from_unit, poses)
+    poses = [move_pose(capture.sphere.world_from_unit, c.world_from_camera) for c in cameras] if options.refine_cameras > 0 else None
+    return assemble(capture, mesh, maps, poses)
 
 
 def refined_cameras(cameras: list[Camera], run, options: MultiviewOptions) -> tuple[list[Camera], np.ndarray]:
@@ -201,44 +200,6 @@ def follow_cameras(bank: PixelBank, cameras: list[Camera], parts: dict[str, np.n
     return cameras, {**parts, "vertices": moved, "normals": (parts["normals"] @ turn.T).astype(np.float32)}
 
 
-def load_pixels(capture: Capture, options: MultiviewOptions, run):
-    """Decode all photos: the pixel bank, cameras (unit frame), masks or None, mean radiance of the object (3,)."""
-    unit_from_world = np.linalg.inv(capture.sphere.world_from_unit)
-    total = sum(p.width * p.height for p in capture.photos)
-    shrink = min(1.0, np.sqrt(options.max_pixels / total))
-    if shrink < 1:
-        size = f"all together {options.max_pixels / 1e6:.0f} megapixels; --set max_pixels=N"
-        run.say(f"photos are used at {shrink:.0%} of their size ({size})")
-    cameras, images, masks, normals = [], [], [], []
-    for photo in capture.photos:
-        pixels, camera = photo.load(), photo.camera
-        rgb, mask, normal = pixels.rgb, pixels.mask, pixels.normal
-        if shrink < 1:
-            w, h = max(16, round(camera.width * shrink)), max(16, round(camera.height * shrink))
-            rgb, mask, normal = (resize(a, w, h) for a in (rgb, mask, normal))
-            camera = camera.resized(w, h)
-        cameras.append(camera.with_pose(move_pose(unit_from_world, camera.world_from_camera)))
-        images.append(rgb)
-        masks.append(mask)
-        normals.append(normal)
-    if any(m is None for m in masks) and not all(m is None for m in masks):
-        run.say("note: some photos have no mask; all photos are used without masks")
-        masks = [None] * len(masks)
-    masked = masks[0] is not None
-    weight = sum(float(m.sum()) for m in masks) if masked else sum(i.shape[0] * i.shape[1] for i in images)
-    level = sum((i * (m[..., None] if masked else 1)).sum((0, 1)) for i, m in zip(images, masks, strict=False)) / max(weight, 1e-6)
-    prior = normals if any(n is not None for n in normals) else None
-    bank = make_bank(cameras, images, masks, prior)
-    return bank, cameras, masks if masked else None, np.maximum(level, 1e-3)
-
-
-def resize(image, width: int, height: int):
-    """Area-averaged (H, W[, C]) float32, or None for None."""
-    import cv2
-
-    return None if image is None else cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-
 def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, options: MultiviewOptions, seed: int) -> VolumeModel:
     """Hull, or without masks a first shape from a radiance field of the whole scene; then the volume pass."""
     if masks is None:
@@ -255,13 +216,15 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
                 raise UserError(
                     "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
                     "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
-                    "look at `relit inspect INPUT`; give --sphere X Y Z RADIUS, or --masks none to do without masks",
+                    "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or --masks none to do without masks",
                     code=4,
                 ) from None
             if options.hollows > 0 and not stage.load("checkpoint"):
                 coarse = visual_hull(cameras, masks, FIRST.nodes)
                 fresh = partial(start_model, level=level, background=None, full=True)
-                values = without(values, open_lids(bank, cameras, coarse, fresh, run.say, seed, options.hollows))
+                show = run.progress("hollows that no silhouette shows")
+                found = open_lids(bank, cameras, coarse, fresh, run.say, seed, options.hollows, progress=show)
+                values = without(values, found)
             model = start_model(values, level, None, full=False)
         else:
             try:
@@ -338,7 +301,7 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
         traced = TraceableMesh(mesh, reflecting)
         metallic, roughness = PAINT, None
         if "first_material" not in options.without and stage.load("checkpoint") is None:
-            metallic, roughness = first_material(bank, traced, start, known, mean, normals, o, seed)
+            metallic, roughness = first_material(bank, traced, start, known, mean, normals, o, seed, run.progress("metal or paint"))
             run.say(describe(metallic, roughness, known))
         model = start_surface(start, known, mean, o, normals, metallic, roughness)
         fit_surface(bank, traced, model, o, stage, seed)
@@ -355,53 +318,13 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
     return maps
 
 
-def vertex_areas(mesh: Mesh) -> np.ndarray:
-    """(V,) a third of the area of the faces around each vertex."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    out = np.zeros(len(mesh.vertices))
-    np.add.at(out, mesh.faces.ravel(), np.repeat(area, 3))
-    return out
-
-
-def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], world_from_unit: np.ndarray, poses=None) -> Asset:
-    """The asset: +Y up where the capture knows its up direction; lengths in the units of the user's cameras.
+def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], poses=None) -> Asset:
+    """The asset in the frame of the user's cameras (`placed_mesh`).
 
     poses: world_from_camera (4, 4) of each photo where the cameras were refined.
     """
-    up = np.array([0.0, 1.0, 0.0]) if capture.up is None else np.asarray(capture.up, np.float64)
-    world_from_asset = similarity(rotation_from_y(up), capture.sphere.centre)
-    asset_from_unit = np.linalg.inv(world_from_asset) @ world_from_unit
-    rotation = asset_from_unit[:3, :3] / np.cbrt(np.linalg.det(asset_from_unit[:3, :3]))
-    placed = replace(
-        mesh,
-        vertices=move_points(asset_from_unit, mesh.vertices).astype(np.float32),
-        normals=(mesh.normals @ rotation.T).astype(np.float32),
-    )
+    placed, world_from_asset = placed_mesh(capture, mesh)
     material = Material(maps["base_color"], maps["roughness"], maps["metallic"], normal=maps["normal"])
     poses = [p.camera.world_from_camera for p in capture.photos] if poses is None else poses
     cameras = tuple((p.name, p.camera.with_pose(pose)) for p, pose in zip(capture.photos, poses, strict=True))
     return Asset(placed, material, world_from_asset, maps["environment"], cameras, {})
-
-
-def rotation_from_y(up: np.ndarray) -> np.ndarray:
-    """The shortest rotation (3, 3) that carries +Y to `up`."""
-    y, u = np.array([0.0, 1.0, 0.0]), up / np.linalg.norm(up)
-    axis, cosine = np.cross(y, u), float(y @ u)
-    if cosine < -0.999999:
-        return np.diag([1.0, -1.0, -1.0])
-    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + k + k @ k / (1 + cosine)
-
-
-def run_arrays(run, stage: str, name: str) -> dict[str, np.ndarray]:
-    """Arrays that a finished stage has kept. Raises UserError where they cannot be read."""
-    from relit.files import NO_ARRAYS, load_arrays
-
-    path = run.folder / "stages" / stage / f"{name}.npz"
-    try:
-        return load_arrays(path)
-    except NO_ARRAYS as error:
-        what = f"what the finished stage '{stage}' has kept cannot be read ({type(error).__name__})"
-        why = "the file was damaged or removed; later stages were computed from it"
-        raise UserError(what, why, f"give the same command with --overwrite to begin anew: {path}") from None

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates, minimum_filter
 
 from relit.conventions import environment_directions, environment_solid_angles, move_points, similarity
+from relit.fit.instances import nearest_pixels
 from relit.fit.pixels import make_bank
 from relit.rendering.pile import ground_square
 from relit.scene import Camera, Ground, Mesh
@@ -184,17 +185,14 @@ def scene_mesh(mesh: Mesh, parts, standing, scene_from_photo, pixels, camera: Ca
 
 def ground_radiance(points: np.ndarray, scene_from_photo: np.ndarray, pixels, camera: Camera) -> np.ndarray:
     """(V, 3) what the photo shows of the ground at points of the scene frame; the median of it where the photo does not."""
-    q = camera.with_pose(scene_from_photo).project(points)
-    x, y = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
-    ok = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height) & (q[:, 2] > 0)
-    x, y = np.clip(x, 0, camera.width - 1), np.clip(y, 0, camera.height - 1)
+    x, y, ok = nearest_pixels(camera.with_pose(scene_from_photo), points)
     ok &= pixels.labels[y, x] == 0
     free = pixels.labels == 0
     usual = np.median(pixels.rgb[free], axis=0) if free.any() else np.full(3, 0.1)
     return np.where(ok[:, None], pixels.rgb[y, x], usual)
 
 
-def ground_colour(pixels, camera: Camera, plane: np.ndarray) -> np.ndarray:
+def ground_colour(pixels, plane: np.ndarray) -> np.ndarray:
     """(3,) median radiance of what is no object."""
     free = pixels.labels == 0
     return np.median(pixels.rgb[free], axis=0) if free.any() and len(plane) else np.zeros(3)

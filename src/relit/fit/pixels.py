@@ -23,8 +23,8 @@ class PixelBank:
     """views, total: counts of photos and pixels. rgbm: Float [total * 4], linear RGB and mask. normals: Float [total * 4] or None
     (camera axes, last entry 1 where known). cameras: Float [views * 16]. offsets, widths: UInt32 [views]. candidates: UInt32, the
     pixels that batches are drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector, translation) or
-    [views * 7] or [views * 8] (see `rays_through`). saturated: linear value from which on a pixel says only "at least this bright".
-    ignored: the one from which on it has no say in the volume pass; infinite: none."""
+    [views * 7] or [views * 8] (see `rays_through`). saturated: see `saturation`; a float, or Float [views] where photos differ.
+    drop_saturated: whether such pixels have no say in the volume pass."""
 
     views: int
     total: int
@@ -36,8 +36,8 @@ class PixelBank:
     candidates: Any
     masked: bool
     corrections: Any
-    saturated: float = SATURATED
-    ignored: float = np.inf
+    saturated: Any = SATURATED
+    drop_saturated: bool = False
 
 
 @dataclass
@@ -60,8 +60,11 @@ def camera_rows(cameras: list[Camera]) -> np.ndarray:
     return np.concatenate(rows).astype(np.float32)
 
 
-def make_bank(cameras: list[Camera], images: list[np.ndarray], masks: list[np.ndarray | None], normals=None, *, radius=1.0) -> PixelBank:
-    """cameras: unit frame. images: (H, W, 3) linear. masks: (H, W) or None each.
+def make_bank(
+    cameras: list[Camera], images: list[np.ndarray], masks: list[np.ndarray | None], normals=None, whites=None, *, radius=1.0
+) -> PixelBank:
+    """cameras: unit frame. images: (H, W, 3) linear. masks: (H, W) or None each. normals: (H, W, 3) or None each, or None. whites: see
+    `saturation`.
 
     Candidates: pixels whose ray meets the object sphere and, where masks are known, lie within a margin of the mask.
     """
@@ -97,8 +100,24 @@ def make_bank(cameras: list[Camera], images: list[np.ndarray], masks: list[np.nd
         mi.UInt32(np.concatenate(candidates)),
         masked,
         dr.zeros(mi.Float, 6 * len(images)),
-        np.inf if max(float(im.max(initial=0)) for im in images) > 1.001 else SATURATED,  # radiance is not clipped in EXR and HDR
+        saturation(images, whites or [None] * len(images)),
     )
+
+
+def saturation(images: list[np.ndarray], whites: list[float | None]):
+    """The linear value from which on a pixel says only "at least this bright": a float, or Float [views] where photos differ.
+
+    whites: what the largest code of each photo stands for (`Pixels.white`), None where its format holds no codes or is not known: such
+    photos are taken to end at 1 unless one of them is brighter, as pictures in EXR or HDR are that were not made from codes.
+    """
+    free = max((float(im.max(initial=0)) for im, white in zip(images, whites, strict=True) if white is None), default=0.0) > 1.001
+    levels = [(np.inf if free else SATURATED) if white is None else SATURATED * white for white in whites]
+    return levels[0] if len(set(levels)) == 1 else mi.Float(np.array(levels, np.float32))
+
+
+def saturated_at(bank: PixelBank, view):
+    """`saturation` of the photos `view` (UInt32): a float, or Float."""
+    return bank.saturated if isinstance(bank.saturated, float) else dr.gather(mi.Float, bank.saturated, view)
 
 
 def sphere_pixels(camera: Camera, radius: float) -> np.ndarray:
@@ -190,9 +209,14 @@ def batch_of(bank: PixelBank, pixel, corrections=None) -> RayBatch:
     return batch
 
 
-def well_exposed(rgb, saturated: float):
-    """Bool: no channel of a Color3f is over-exposed; True (a Python bool) where nothing can be."""
-    return True if np.isinf(saturated) else dr.max(rgb) < saturated
+def well_exposed(rgb, saturated):
+    """Bool: no channel of a Color3f is over-exposed; True (a Python bool) where nothing can be. saturated: of `saturated_at`."""
+    return True if unlimited(saturated) else dr.max(rgb) < saturated
+
+
+def unlimited(saturated) -> bool:
+    """Whether no pixel of any photo can be over-exposed."""
+    return isinstance(saturated, float) and np.isinf(saturated)
 
 
 def draw_pixels(bank: PixelBank, rng, count: int):

@@ -39,7 +39,7 @@ PARTS = (0.6, 2.0, 0.15)  # weights of silhouette, chromaticity and log luminanc
 AHEAD = np.array([0.0, 0.0, 1.0])  # the optical axis in a camera's own axes
 CHUNK = 1 << 20  # rays that are rendered at a time
 
-REFINE = (0, 0, 6.0, 3.0, 1.5, 0.75)  # degrees
+REFINE = (0, 0, 6.0, 3.0, 1.5, 0.75)  # degrees, the rounds of `refine`
 
 Render = Callable[[list[Camera]], tuple[np.ndarray, np.ndarray]]  # cameras in the model's frame, all of one size -> rgb, alpha
 
@@ -388,7 +388,7 @@ def refine(
     render: Render,
     *,
     rings: Rings | None = None,
-    steps=(0, 0, 6.0, 3.0, 1.5, 0.75),
+    steps=REFINE,
     turn=12.0,
     parts=PARTS,
 ):

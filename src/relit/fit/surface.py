@@ -6,6 +6,7 @@ and light texels. Shape is fixed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from relit.fit.exchange import REFRESH, Exchange
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_weight, weighted_mean
-from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels
+from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels, saturated_at
 from relit.fit.preview import surface_preview
 from relit.lighting.environment import Environment
 from relit.lighting.gaussian_light import GaussianLight
@@ -39,10 +40,10 @@ class SurfaceOptions:
     similarity_width in base colour; smooth_shade: power of `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary,
     metallic_sparse: of m (1 - m), and of the distance of m from the side that a place began on, 0 or 1. bright: of base colour beyond
     WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma; light_even: its squared distance from its
-    mean. light_steps: after them the light rests, and `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width,
-    parsimony_share: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves.
-    slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser
-    (see `Adam`), so that noise does not move it at full rate.
+    mean. light_steps: after them the light rests, and `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width:
+    see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth:
+    weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise
+    does not move it at full rate.
     """
 
     steps: int = 700
@@ -75,7 +76,6 @@ class SurfaceOptions:
     scale_power: float = 0.5
     parsimony: float = 0.02
     parsimony_width: float = 0.1
-    parsimony_share: float = 0.0
     slope_rate: float = 0.01
     slope_begin: float = 0.25
     slope_small: float = 0.02
@@ -151,7 +151,6 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
 
     def step(i: int) -> dict:
         decay = cosine_decay(i / options.steps, 0.05)
-        light_decay = cosine_decay(i / light_steps, 0.05) * (i < light_steps)
         warm = min(1.0, 0.05 + (i / (options.warm * light_steps)) ** 2)  # the light first: base colour could explain all shading at once
         batch, points = drawn_points(bank, mesh, rng, count)
         valid = points.valid
@@ -167,52 +166,59 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             dr.eval(start.base, start.roughness, start.metallic, side, points.n)
         lights = sample_lights(mesh, points, start, environment, options.directions, rng)
 
-        # opaque: the weight must not become a literal
-        colour_smoothing = dr.opaque(mi.Float, options.smooth_colour)
-        few = dr.opaque(mi.Float, float(i < light_steps))
-
-        params = [material.colour, material.metallic, light_parameters(model), material.slope]
+        colour_smoothing = dr.opaque(mi.Float, options.smooth_colour)  # opaque: the weight must not become a literal
+        params = [material.colour, material.metallic, material.slope, *([light_parameters(model)] if i < light_steps else [])]
         dr.enable_grad(*params)
-        log_light = model.log_light if gaussians is None else gaussians.log_radiance()
-        environment.radiance = dr.exp(log_light)
+        if i < light_steps:
+            log_light = model.log_light if gaussians is None else gaussians.log_radiance()
+            environment.radiance = dr.exp(log_light)
         surface = material_at(material, points.uv, valid)
         slope = slope_at(material, points.uv, valid)
         points.n = smooth_n
         bend = slope.x * points.t + slope.y * points.b
         points.n = bent_normal(points, slope)
         a, b = reflected(points, lights, surface, environment)
-        fit = dual_loss(a, b, batch.rgb, valid, bank.saturated)
+        fit = dual_loss(a, b, batch.rgb, valid, saturated_at(bank, batch.view))
         lit = brightness(batch.rgb, surface.base, valid, options.smooth_shade)
-        prior = material_prior(material, surface, near, valid, options, colour_smoothing * lit, side) + light_prior(log_light, options)
-        prior += few * parsimony(material, surface, points.uv, valid, shift, options) + slope_prior(material, bend, close, valid, options)
+        level = common_scale(surface, valid, options.scale_power)
+        prior = material_prior(material, surface, near, valid, level, options, colour_smoothing * lit, side)
+        prior += slope_prior(material, bend, close, valid, options)
+        if i < light_steps:
+            prior += light_prior(log_light, options)
+        if i < light_steps and options.parsimony > 0:
+            prior += parsimony(material, surface, points.uv, valid, level, shift, options)
         dr.backward(fit + prior)
         gradients = [dr.grad(p) for p in params]
         dr.disable_grad(*params)
         dr.eval(gradients, fit)
         material.colour = adam_colour.step(dr.detach(material.colour), gradients[0], options.colour_rate * decay * warm, ratio)
         material.metallic = adam_metallic.step(dr.detach(material.metallic), gradients[1], options.metallic_rate * decay)
+        slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
+        material.slope = adam_slope.step(dr.detach(material.slope), gradients[2], slope_rate)
+        if i < light_steps:
+            move_light(i, gradients[3], gradients[0])
+        project(material)
+        dr.eval(material.colour, material.metallic, material.slope)
+        return {"colour": fit}
+
+    def move_light(i: int, gradient, colour_gradient) -> None:
+        decay = cosine_decay(i / light_steps, 0.05)
         if gaussians is None:
-            model.log_light = adam_light.step(dr.detach(model.log_light), gradients[2], options.light_rate * light_decay)
+            model.log_light = adam_light.step(dr.detach(model.log_light), gradient, options.light_rate * decay)
         else:
-            rate = options.light_rate * light_decay
-            gaussians.parameters = adam_light.step(dr.detach(gaussians.parameters), gradients[2], rate, gaussians.rates)
+            gaussians.parameters = adam_light.step(dr.detach(gaussians.parameters), gradient, options.light_rate * decay, gaussians.rates)
             gaussians.project()
             model.log_light = gaussians.log_radiance()
-        slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
-        material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
-        if options.exchange_rate > 0 and gaussians is None and i < light_steps:
+        if options.exchange_rate > 0 and gaussians is None:
             if i % REFRESH == 0 or i == first:
-                exchange.refresh(environment.image())
+                exchange.refresh(environment.radiance)
             dr.eval(material.colour, model.log_light)
-            rate, metallic = options.exchange_rate * light_decay, material.metallic if options.exchange_mirrored else None
-            pulls = (gradients[0], gradients[2])
+            rate, metallic = options.exchange_rate * decay, material.metallic if options.exchange_mirrored else None
+            pulls = (colour_gradient, gradient)
             material.colour, model.log_light = exchange.step(material.colour, model.log_light, *pulls, rate, metallic)
-        project(material)
-        dr.eval(model.log_light, material.colour, material.metallic, material.slope)
         environment.radiance = dr.exp(model.log_light)
-        dr.eval(environment.radiance)
+        dr.eval(model.log_light, environment.radiance)
         environment.rebuild()
-        return {"colour": fit}
 
     def state() -> dict:
         names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": light_parameters(model)}
@@ -226,9 +232,10 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     return model
 
 
-def drawn_points(bank: PixelBank, mesh: TraceableMesh, rng, count: int):
-    """`count` drawn pixels (RayBatch) and the surface they show (Points), valid where a pixel is all object and not seen too flat."""
-    pixel = draw_pixels(bank, rng, count)
+def drawn_points(bank: PixelBank, mesh: TraceableMesh, rng, count: int, draw: Callable = draw_pixels):
+    """`count` drawn pixels (RayBatch) and the surface they show (Points), valid where a pixel is all object and not seen too flat. draw:
+    what draws them, called as `draw_pixels`."""
+    pixel = draw(bank, rng, count)
     dr.eval(pixel, rng)
     batch = batch_of(bank, pixel)
     points = first_hits(mesh, batch.o, batch.d)
@@ -237,14 +244,14 @@ def drawn_points(bank: PixelBank, mesh: TraceableMesh, rng, count: int):
     return batch, points
 
 
-def dual_loss(a, b, target, valid, saturated: float = SATURATED):
+def dual_loss(a, b, target, valid, saturated=SATURATED):
     """Mean of `dual_values` over valid points."""
     return weighted_mean(dual_values(a, b, target, saturated), dr.select(valid, mi.Float(1), 0))
 
 
-def dual_values(a, b, target, saturated: float = SATURATED):
+def dual_values(a, b, target, saturated=SATURATED):
     """display_weight (a - L*)(b - L*), mean over channels (Float); a and b are independent estimates of L, so this is unbiased for the
-    squared error. A pixel from `saturated` on only says "at least this bright"."""
+    squared error. A pixel from `saturated` (float or Float) on only says "at least this bright"."""
     value = (a - target) * (b - target) * display_weight(target)
     mean = dr.detach((a + b) * 0.5)
     value = dr.select((target >= saturated) & (mean > target), 0, value)
@@ -281,12 +288,11 @@ def common_scale(surface, valid, power: float = 0.5):
     return mi.Color3f(*[(ALBEDO_START / dr.maximum(weighted_mean(c, w), 1e-3)) ** power for c in surface.base])
 
 
-def material_prior(material: MaterialField, surface, near: Points, valid, options: SurfaceOptions, colour_smoothing, side=0.0):
+def material_prior(material: MaterialField, surface, near: Points, valid, level, options: SurfaceOptions, colour_smoothing, side=0.0):
     """SfD Eq. (5) E_smooth, E_metal and E_sparse, with smoothness as a similarity kernel: neighbours with like base colour should share
-    roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float). side: Float, 1 where the surface began as
-    metal, whose E_sparse pulls to 1."""
+    roughness, metallic and, more strictly, base colour (weight colour_smoothing, opaque Float). level: `common_scale`. side: Float, 1 where
+    the surface began as metal, whose E_sparse pulls to 1."""
     other = material_at(material, near.uv, near.valid)
-    level = common_scale(surface, valid, options.scale_power)
     step = (other.base - surface.base) * level
     difference = dr.detach(step)
     alike = dr.exp(-dr.squared_norm(mi.Vector3f(difference)) / (2 * options.similarity_width**2))
@@ -303,20 +309,17 @@ def material_prior(material: MaterialField, surface, near: Points, valid, option
     return dr.mean(smooth * w) + dr.mean(dr.select(valid, single, 0))
 
 
-def parsimony(material: MaterialField, surface, uv, valid, shift, options: SurfaceOptions):
+def parsimony(material: MaterialField, surface, uv, valid, level, shift, options: SurfaceOptions):
     """An object has few materials (Barron & Malik 2015, Sec. 4.2): pairs of points anywhere on it attract each other's display value of
-    base colour when they are closer than about parsimony_width, and then share roughness and metallic too. shift: opaque UInt32, how far
-    the partner of a point is in the batch."""
+    base colour when they are closer than about parsimony_width. level: `common_scale`. shift: opaque UInt32, how far the partner of a
+    point is in the batch."""
     n = dr.width(uv)
     partner = (dr.arange(mi.UInt32, n) + shift) % n
-    level = common_scale(surface, valid, options.scale_power)
     uv, valid = dr.gather(mi.Point2f, uv, partner), valid & dr.gather(mi.Bool, valid, partner)
     other = material_at(material, uv, valid)
     shown = lambda c: dr.maximum(c * level, 1e-3) ** (1 / 2.2)  # noqa: E731
     alike = dr.exp(-dr.squared_norm(mi.Vector3f(shown(other.base) - shown(surface.base))) / (2 * options.parsimony_width**2))
-    share = dr.abs(other.roughness - surface.roughness) + dr.abs(other.metallic - surface.metallic)
-    value = options.parsimony_share * dr.detach(alike) * share - options.parsimony * alike
-    return dr.mean(dr.select(valid, value, 0))
+    return -options.parsimony * dr.mean(dr.select(valid, alike, 0))
 
 
 def slope_prior(material: MaterialField, bend, close: Points, valid, options: SurfaceOptions):

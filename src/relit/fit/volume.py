@@ -16,7 +16,7 @@ import numpy as np
 
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_loss, mask_loss, normal_loss
-from relit.fit.pixels import PixelBank, RayBatch, batch_of, camera_rows, draw_pixels, rays_through, well_exposed
+from relit.fit.pixels import PixelBank, RayBatch, batch_of, camera_rows, draw_pixels, rays_through, saturated_at, unlimited, well_exposed
 from relit.fit.preview import volume_preview
 from relit.geometry.sdf import (
     SdfGrid,
@@ -188,8 +188,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
             colour = colour + m.transmittance * render_background(model.background, batch.o, batch.d, jitter)
         # with masks, only whole object pixels: silhouettes are the mask term's, which has no preference for dark or bright
         counts = hit & (batch.mask > 0.99) if bank.masked else None
-        if np.isfinite(bank.ignored):  # what is over-exposed only says "at least this bright": taken at its word it pulls highlights down
-            exposed = well_exposed(batch.rgb, bank.ignored)
+        if bank.drop_saturated and not unlimited(bank.saturated):  # "at least this bright", taken at its word, pulls highlights down
+            exposed = well_exposed(batch.rgb, saturated_at(bank, batch.view))
             counts = exposed if counts is None else counts & exposed
         loss = display_loss(colour, batch.rgb, counts)
         report = {"colour": loss}

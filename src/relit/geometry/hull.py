@@ -41,8 +41,3 @@ def distance_of(inside: np.ndarray) -> np.ndarray:
     if not inside.any() or inside.all():
         raise ValueError("the occupancy is empty or full")
     return ((distance_transform_edt(~inside) - distance_transform_edt(inside)) * h).astype(np.float32)
-
-
-def ball(n: int, radius: float) -> np.ndarray:
-    """Signed distance (n, n, n) of a ball around the origin."""
-    return (np.linalg.norm(node_positions(n), axis=-1) - radius).astype(np.float32)

@@ -86,3 +86,12 @@ def field_normals(values: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Unit outward normals (N, 3) float32 of the level sets at points (N, 3)."""
     g = field_gradient(values, points)
     return (g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-9)).astype(np.float32)
+
+
+def vertex_areas(mesh: Mesh) -> np.ndarray:
+    """(V,) a third of the area of the faces around each vertex."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    out = np.zeros(len(mesh.vertices))
+    np.add.at(out, mesh.faces.ravel(), np.repeat(area, 3))
+    return out

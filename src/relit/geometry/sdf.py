@@ -118,13 +118,6 @@ def row_features(grid: SdfGrid) -> np.ndarray:
     return np.array(grid.features).reshape(grid.rows, grid.channels)
 
 
-def gather_rows_at(grid: SdfGrid, values: np.ndarray) -> np.ndarray:
-    """Node values (n^3, C) of another field on this grid's rows -> (rows, C); row 0 is zero."""
-    out = np.zeros((grid.rows, values.shape[1]), np.float32)
-    out[1:] = values[np.array(grid.nodes)]
-    return out
-
-
 def smoothness_gradient(grid: SdfGrid, eikonal):
     """Two Floats [rows]: the gradient of eikonal * mean over the band of (|∇S| - 1)^2 with respect to the row values (SfD Eq. 4,
     E_reg), and L S, the mean of the six neighbours minus the value.
@@ -171,14 +164,3 @@ def neighbour_mean_difference(grid: SdfGrid, rows):
     out = dr.zeros(mi.Float, grid.rows)
     dr.scatter(out, dr.select(ok, around * (1 / 6) - dr.gather(mi.Float, rows, own), 0), own)
     return out
-
-
-def eikonal_energy(grid: SdfGrid) -> float:
-    """The energy whose gradient `smoothness_gradient` returns, for weight 1 (NumPy, for tests and reports)."""
-    v, h = dense_values(grid).astype(np.float64), grid.h
-    sides = [(np.roll(v, -1, k)[1:-1, 1:-1, 1:-1], np.roll(v, 1, k)[1:-1, 1:-1, 1:-1]) for k in (0, 1, 2)]
-    norm = np.sqrt(sum(((p - m) / (2 * h)) ** 2 for p, m in sides))
-    band = np.zeros(grid.n**3, bool)
-    band[np.array(grid.nodes)] = True
-    band = band.reshape(v.shape)[1:-1, 1:-1, 1:-1]
-    return float(((norm - 1) ** 2)[band].sum() / (grid.rows - 1))

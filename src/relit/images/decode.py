@@ -6,11 +6,12 @@ import io
 import struct
 import warnings
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image as PilImage
-from PIL import ImageCms, UnidentifiedImageError
+from PIL import ImageCms, TiffImagePlugin, UnidentifiedImageError
 
 from relit.errors import UserError
 
@@ -19,6 +20,7 @@ HEIC = {".heic", ".heif"}
 RAW = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".rw2", ".raf"}
 FLOAT = {".exr", ".hdr"}
 CODED = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
+FLOATING = 3  # TIFF's sample format
 EXTENSIONS = CODED | FLOAT | HEIC | RAW
 
 
@@ -59,6 +61,9 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
         flip = {} if upright else {"user_flip": 0}
         with raw_file(path) as raw:  # camera white balance, no automatic exposure, linear
             return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, **flip), True
+    floats = float_tiff(path)
+    if floats is not None:
+        return _finite(_float_colours(path, floats.orientation if upright else 1), path), True
     with pil(path) as image:
         try:
             orientation = orientation_of(image) if upright else 1
@@ -107,12 +112,68 @@ def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
     """OpenCV keeps all 16 bits where Pillow drops the lower eight of a colour file."""
     import cv2
 
-    array = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    codes = np.frombuffer(_as_stored(path.read_bytes()), np.uint8)
+    array = cv2.imdecode(codes, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if array is None or array.dtype.kind not in "uf":
         raise ValueError("the pixels could not be decoded")
     if array.ndim == 3:
         array = array[..., [2, 1, 0, 3][: array.shape[2]]] if array.shape[2] >= 3 else array
     return turn_upright(array, orientation)
+
+
+@dataclass(frozen=True)
+class FloatTiff:
+    """A TIFF of floating-point colours, which Pillow does not open. width, height: as stored. alpha: has a fourth channel.
+    orientation: EXIF's, 1 to 8."""
+
+    width: int
+    height: int
+    alpha: bool
+    orientation: int
+
+
+def float_tiff(path: Path) -> FloatTiff | None:
+    """What the head of a TIFF of floating-point colours says; None for all other files (a TIFF of grey floats is Pillow's mode F)."""
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return None
+    try:
+        with open(path, "rb") as file:
+            head = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
+            file.seek(head.next)
+            head.load(file)
+        channels, kinds = int(head.get(TiffImagePlugin.SAMPLESPERPIXEL, 1)), head.get(TiffImagePlugin.SAMPLEFORMAT, (1,))
+        width, height = int(head[TiffImagePlugin.IMAGEWIDTH]), int(head[TiffImagePlugin.IMAGELENGTH])
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error, OverflowError):
+        return None  # Pillow says what is wrong with it
+    if channels < 3 or kinds[0] != FLOATING:
+        return None
+    _too_large(path, width, height)
+    turn = head.get(0x0112, 1)
+    return FloatTiff(width, height, channels == 4, turn if turn in range(1, 9) else 1)
+
+
+def _float_colours(path: Path, orientation: int) -> np.ndarray:
+    try:
+        return _sixteen_bit(path, orientation).astype(np.float32)
+    except (ValueError, struct.error) as error:
+        raise UserError(
+            "a floating-point TIFF cannot be read",
+            "it is damaged, or of a kind that is not read: half floats, planes apart, more than 4 channels, some compressions",
+            f"save it as EXR: {path}",
+        ) from error
+
+
+def _as_stored(data: bytes) -> bytes:
+    """A file's bytes; of a TIFF with orientation 1: OpenCV, told to ignore it, still mirrors it and refuses what lies on its side."""
+    order = {b"II": "<", b"MM": ">"}.get(data[:2])
+    if order is None or struct.unpack(order + "H", data[2:4]) != (42,):
+        return data
+    out, (begin,) = bytearray(data), struct.unpack(order + "I", data[4:8])
+    (count,) = struct.unpack_from(order + "H", data, begin)
+    for entry in range(begin + 2, begin + 2 + 12 * count, 12):
+        if struct.unpack_from(order + "H", data, entry) == (0x0112,):
+            struct.pack_into(order + "H", out, entry + 8, 1)
+    return bytes(out)
 
 
 def early_exif(image: PilImage.Image) -> PilImage.Exif:
@@ -125,6 +186,12 @@ def orientation_of(image: PilImage.Image) -> int:
     """EXIF's orientation, 1 to 8; the one place that decides it, so that size and pixels agree."""
     value = early_exif(image).get(0x0112, 1)
     return value if value in range(1, 9) else 1
+
+
+def stored_size(image: PilImage.Image) -> tuple[int, int]:
+    """Width and height of the pixels as stored: of a TIFF Pillow tells those that it will have when it is turned."""
+    tags = getattr(image, "tag_v2", None)
+    return image.size if tags is None else (int(tags[TiffImagePlugin.IMAGEWIDTH]), int(tags[TiffImagePlugin.IMAGELENGTH]))
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:

@@ -21,11 +21,13 @@ from relit.images.decode import (
     decode,
     early_exif,
     exr,
+    float_tiff,
     hdr_size,
     orientation_of,
     pil,
     raw_file,
     standard_colours,
+    stored_size,
     turn_upright,
 )
 from relit.images.write import codes_of
@@ -68,8 +70,8 @@ class Header:
 def read_image(path: str | Path, upright: bool = True) -> Image:
     """Decode a photo to linear float32, EXIF orientation applied once (or not at all with upright=False).
 
-    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed; 8-bit files with another colour profile are carried to sRGB before), EXR and HDR
-    (linear already), HEIC and RAW with the optional extras.
+    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed; 8-bit files with another colour profile are carried to sRGB before), EXR, HDR and
+    TIFF of floats (linear already), HEIC and RAW with the optional extras.
     Raises UserError for a missing, truncated, oversized or unknown file and for NaN or infinite pixels.
     """
     path = Path(path)
@@ -111,7 +113,7 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
             orientation = orientation_of(image) if upright else 1
             image.draft("RGB", (side, side))
             has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-            if image.mode.startswith("I"):
+            if image.mode.startswith("I") or image.format == "TIFF":
                 array, _ = decode(path, upright=False, colours=False)
                 image = PilImage.fromarray(codes_of(_unit(array)))
             small = image.convert("RGBA" if has_alpha else "RGB")
@@ -123,7 +125,9 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
 
 
 def _is_float(path: Path) -> bool:
-    """Is it a TIFF of grey floats (Pillow's mode F)?"""
+    """Is it a TIFF of floats?"""
+    if float_tiff(path) is not None:
+        return True
     with pil(path) as image:
         return image.mode == "F"
 
@@ -151,8 +155,12 @@ def read_header(path: str | Path) -> Header:
             w, h = raw.sizes.width, raw.sizes.height
         w, h = (h, w) if orientation >= 5 else (w, h)
         return Header(w, h, False, _raw_focal(path, w, h), orientation)
+    floats = float_tiff(path)
+    if floats is not None:
+        w, h = (floats.height, floats.width) if floats.orientation >= 5 else (floats.width, floats.height)
+        return Header(w, h, floats.alpha, None, floats.orientation)
     with pil(path) as image:
-        w, h = image.size
+        w, h = stored_size(image)
         orientation, exif = orientation_of(image), early_exif(image)
         w, h = (h, w) if orientation >= 5 else (w, h)
         has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info

@@ -107,9 +107,9 @@ class Environment:
         h, w = self.height, self.width
         with dr.suspend_grad():
             total = dr.gather(mi.Float, self._rows, mi.UInt32(h - 1))
-            row, at = _invert(self._rows, mi.UInt32(0), h, u2.y * total)
+            row, at = invert_cdf(self._rows, mi.UInt32(0), h, u2.y * total)
             span = dr.gather(mi.Float, self._within_row, row * w + (w - 1))
-            column, across = _invert(self._within_row, row * w, w, u2.x * span)
+            column, across = invert_cdf(self._within_row, row * w, w, u2.x * span)
             phi = (mi.Float(column) + across) * (2 * dr.pi / w)
             cos_theta = dr.lerp(dr.cos(mi.Float(row) * (dr.pi / h)), dr.cos(mi.Float(row + 1) * (dr.pi / h)), at)
             s, (sin_phi, cos_phi) = dr.safe_sqrt(1 - cos_theta * cos_theta), dr.sincos(phi)
@@ -117,7 +117,7 @@ class Environment:
             return d, dr.gather(mi.Float, self._density, row * w + column)
 
 
-def _invert(cdf, start, n: int, x):
+def invert_cdf(cdf, start, n: int, x):
     """Cell (0 .. n - 1) of the running sum `cdf[start : start + n]` in which `x` falls, and the position within it in [0, 1)."""
     k = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float, cdf, start + i) <= x)
     k = dr.minimum(mi.UInt32(k), n - 1)

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.conventions import environment_solid_angles
-from relit.lighting.environment import FLOOR, _invert, latlong_uv, lookup_latlong
+from relit.lighting.environment import FLOOR, invert_cdf, latlong_uv, lookup_latlong
 
 ROWS, COLUMNS = 16, 32
 TEXELS = ROWS * COLUMNS
@@ -132,10 +132,10 @@ class LightOf:
         with dr.suspend_grad():
             first = self.light * ROWS
             total = dr.gather(mi.Float, t._rows, first + (ROWS - 1))
-            row, at = _invert(t._rows, first, ROWS, u2.y * total)
+            row, at = invert_cdf(t._rows, first, ROWS, u2.y * total)
             start = (first + row) * COLUMNS
             span = dr.gather(mi.Float, t._within_row, start + (COLUMNS - 1))
-            column, across = _invert(t._within_row, start, COLUMNS, u2.x * span)
+            column, across = invert_cdf(t._within_row, start, COLUMNS, u2.x * span)
             phi = (mi.Float(column) + across) * (2 * dr.pi / COLUMNS)
             cos_theta = dr.lerp(dr.cos(mi.Float(row) * (dr.pi / ROWS)), dr.cos(mi.Float(row + 1) * (dr.pi / ROWS)), at)
             s, (sin_phi, cos_phi) = dr.safe_sqrt(1 - cos_theta * cos_theta), dr.sincos(phi)

@@ -13,6 +13,7 @@ from relit.images.decode import CODED, pil
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr")
 FOLDERS = ("masks", "mask", "segmentations", "silhouettes")
+LOSSY = (".jpg", ".jpeg", ".webp")  # black is not exactly 0 there
 BORDER = 0.9  # an inverted mask covers at least this share of the photo's border
 
 
@@ -64,16 +65,30 @@ def _number(stem: str) -> int | None:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(H, W) float32 in [0, 1]: the alpha channel where it varies, else the mean of the colour channels."""
+    """(H, W) float32 in [0, 1]: the alpha channel where it varies, else the mean of the colour channels; see `read_counted`."""
+    return read_counted(path)[0]
+
+
+def read_counted(path: Path) -> tuple[np.ndarray, bool]:
+    """`read_mask`, and whether the file holds the numbers 0 and 1 in the place of black and white: 1 is the object then."""
     data = np.clip(read_data(path), 0.0, 1.0)
-    if data.ndim == 2:
-        return data
-    if data.shape[2] in (2, 4):
+    if data.ndim == 3 and data.shape[2] in (2, 4):
         alpha = data[..., -1]
         if alpha.min() < 0.5 < alpha.max():
-            return alpha
+            return alpha, False
         data = data[..., :-1]
-    return _of_palette(data) if _indexed(path) else data.mean(axis=-1)
+    if data.ndim == 3 and _indexed(path):
+        return _of_palette(data), False
+    mask = data if data.ndim == 2 else data.mean(axis=-1)
+    if path.suffix.lower() not in LOSSY and _is_counted(mask):
+        return (mask > 0).astype(np.float32), True
+    return mask, False
+
+
+def _is_counted(mask: np.ndarray) -> bool:
+    """Whether a decoded picture holds no codes but 0 and 1, of 255 or of 65535, as programs write that number objects."""
+    top = float(mask.max(initial=0.0))
+    return any(abs(top * codes - 1) < 1e-3 for codes in (255, 65535)) and bool(((mask == 0) | (mask == top)).all())
 
 
 def _indexed(path: Path) -> bool:

@@ -23,6 +23,7 @@ import numpy as np
 IOR = 1.49  # polypropylene, PIR Sec. 3.2
 MIN_ALPHA = 0.02
 MIN_COS = 0.02  # clamp of the viewer's cosine at the rims of a mesh
+LOBE_SHARE = 0.5  # of the directions that are drawn from the lobe: what inter-reflection is about (PIR Sec. 3.4) is in it
 COSINES, WIDTHS = 64, 33  # of the tables: cos θ evenly from 0 to 1, sqrt(alpha) evenly from sqrt(MIN_ALPHA) to 1
 
 
@@ -156,11 +157,6 @@ def evaluate(m: Plastic, coat: Coat, n, v, l):
     return mi.Color3f(dr.select(lit, m.diffuse * base + m.specular * lobe, 0))
 
 
-def specular_share(m: Plastic):
-    """Probability of sampling the lobe, detached: half, for what inter-reflection is about (PIR Sec. 3.4) is in the lobe."""
-    return 0.5
-
-
 def sample(m: Plastic, n, v, u_lobe, u2):
     """Direction l drawn from `pdf`: visible normals of the lobe, or the cosine; u_lobe: Float, u2: Point2f. May fall below the horizon."""
     with dr.suspend_grad():
@@ -175,7 +171,7 @@ def sample(m: Plastic, n, v, u_lobe, u2):
         hh = mi.Vector3f(s * cos_phi, s * sin_phi, z) + vh  # Dupuy & Benyoub 2023: spherical caps
         h = dr.normalize(mi.Vector3f(hh.x * a, hh.y * a, dr.maximum(hh.z, 1e-6)))
         l_spec = 2 * dr.dot(wo, h) * h - wo
-        return frame.to_world(dr.select(u_lobe < specular_share(m), l_spec, mi.warp.square_to_cosine_hemisphere(u2)))
+        return frame.to_world(dr.select(u_lobe < LOBE_SHARE, l_spec, mi.warp.square_to_cosine_hemisphere(u2)))
 
 
 def pdf(m: Plastic, n, v, l):
@@ -187,5 +183,5 @@ def pdf(m: Plastic, n, v, l):
         a = dr.maximum(m.alpha, MIN_ALPHA)
         h = dr.normalize(mi.Frame3f(n).to_world(wo) + l)
         lobe = ggx_d(dr.clip(dr.dot(n, h), 0, 1), a) * smith_g1(wo.z, a) / (4 * wo.z)
-        share, cos = specular_share(m), dr.dot(n, l)
-        return dr.select(cos > 0, share * lobe + (1 - share) * cos * dr.inv_pi, 0)
+        cos = dr.dot(n, l)
+        return dr.select(cos > 0, LOBE_SHARE * lobe + (1 - LOBE_SHARE) * cos * dr.inv_pi, 0)

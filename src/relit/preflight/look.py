@@ -70,7 +70,7 @@ def look(capture: Capture, photo: Photo) -> Look:
         None if a is None else cv2.resize(np.ascontiguousarray(a), size, interpolation=cv2.INTER_AREA) for a in (pixels.rgb, pixels.mask)
     )
     camera = None if photo.camera is None else photo.camera.resized(*size)
-    path = capture.root / photo.name if capture.root.is_dir() else capture.root.parent / photo.name
+    path = capture.folder / photo.name
     return Look(photo.name, rgb, mask, camera, sharpness(pixels.rgb, pixels.mask), _opaque(path), read_exif(path))
 
 

@@ -19,7 +19,7 @@ from relit.errors import UserError
 from relit.lighting.flash import flash_position
 from relit.materials import rough_plastic
 from relit.rendering.bsdf import shading_normal
-from relit.rendering.mitsuba_scene import _camera_rays, _moved, _passes, _shape, _texture, _unit_from_world
+from relit.rendering.mitsuba_scene import camera_rays, mitsuba_mesh, mitsuba_texture, moved_mesh, sample_passes, unit_ball
 from relit.scene import Camera, Flash, Material, Mesh
 
 PLUGIN = "relit_rough_plastic"
@@ -107,16 +107,16 @@ def build_flash_scene(mesh: Mesh, material: Material, world_from_asset=None) -> 
     world_from_asset = np.eye(4) if world_from_asset is None else np.asarray(world_from_asset, np.float64)
     specular = np.ones((1, 1), np.float32) if material.specular is None else np.asarray(material.specular, np.float32)
     t = {
-        "base_color": _texture(material.base_color if material.diffuse is None else material.diffuse, color=True),
-        "roughness": _texture(material.roughness),
-        "specular": _texture(specular.mean(-1) if specular.ndim == 3 else specular),
-        "normalmap": None if material.normal is None else _texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),
+        "base_color": mitsuba_texture(material.base_color if material.diffuse is None else material.diffuse, color=True),
+        "roughness": mitsuba_texture(material.roughness),
+        "specular": mitsuba_texture(specular.mean(-1) if specular.ndim == 3 else specular),
+        "normalmap": None if material.normal is None else mitsuba_texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),
     }
     d = {"type": register(), "int_ior": float(material.ior), **{k: v for k, v in t.items() if v is not None}}
-    unit_from_world = _unit_from_world(mesh, world_from_asset)
-    unit = _moved(mesh, unit_from_world @ world_from_asset)
+    unit_from_world = unit_ball(mesh, world_from_asset)
+    unit = moved_mesh(mesh, unit_from_world @ world_from_asset)
     light = {"type": "point", "position": [0.0, 0.0, 3.0], "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
-    scene = mi.load_dict({"type": "scene", "object": _shape(unit, mi.load_dict(d), t["normalmap"] is not None), "light": light})
+    scene = mi.load_dict({"type": "scene", "object": mitsuba_mesh(unit, mi.load_dict(d), t["normalmap"] is not None), "light": light})
     return FlashScene(scene, t, unit_from_world, mi.traverse(scene))
 
 
@@ -131,8 +131,8 @@ def render_flash(scene: FlashScene, camera: Camera, flash: Flash, spp: int = 64,
     path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True})
     total = np.zeros((pixels, 4))
     with dr.suspend_grad():
-        for sampler, n in _passes(camera, spp, seed):
-            ray, _ = _camera_rays(scene, camera, sampler, n * pixels)
+        for sampler, n in sample_passes(camera, spp, seed):
+            ray, _ = camera_rays(scene, camera, sampler, n * pixels)
             colour, hit, _ = path.sample(scene.mi_scene, sampler, ray)
             rgba = [*colour, dr.select(hit, mi.Float(1), 0)]
             dr.eval(rgba)
@@ -150,8 +150,8 @@ def render_maps(scene: FlashScene, camera: Camera, spp: int = 16, seed: int = 0)
     total = np.zeros((pixels, 9))
     t = scene.textures
     with dr.suspend_grad():
-        for sampler, n in _passes(camera, spp, seed):
-            ray, _ = _camera_rays(scene, camera, sampler, n * pixels)
+        for sampler, n in sample_passes(camera, spp, seed):
+            ray, _ = camera_rays(scene, camera, sampler, n * pixels)
             si = scene.mi_scene.ray_intersect(ray)
             hit = si.is_valid()
             normal = si.to_world(mi.Vector3f(shading_normal(si, t["normalmap"], hit)))

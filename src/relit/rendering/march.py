@@ -281,6 +281,15 @@ class Marched:
     def opacity(self):
         return 1 - self.transmittance
 
+    @property
+    def unit_normal(self):
+        """Vector3f; shorter where nothing is hit."""
+        return self.normal * dr.rsqrt(dr.maximum(dr.squared_norm(self.normal), 1e-8))
+
+    def surface_point(self, o, d):
+        """Where the rays meet the surface: at their mean depth."""
+        return o + d * (self.depth / dr.maximum(self.opacity, 0.05))
+
 
 def march(grid: SdfGrid, o, d, t0, t1, inv_s, dt) -> Marched:
     """Render `grid` along rays o + t d, t in [t0, t1] (unit frame; an empty interval gives opacity 0).

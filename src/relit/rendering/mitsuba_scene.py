@@ -38,7 +38,7 @@ class Scene:
     origins: SmoothOrigins | None
 
 
-def _texture(array, *, color=False):
+def mitsuba_texture(array, *, color=False):
     """Mitsuba texture (float32, no transfer curve) of an (H, W) or (H, W, 3) array with row 0 at v = 0."""
     a = np.asarray(array, np.float32)
     a = a[..., None] if a.ndim == 2 else a
@@ -64,21 +64,23 @@ def environment_bitmap(environment):
     return out
 
 
-def _unit_from_world(mesh: Mesh, world_from_asset) -> np.ndarray:
+def unit_ball(mesh: Mesh, world_from_asset) -> np.ndarray:
+    """unit_from_world (4, 4), scale and translation, with which the mesh fills the unit ball."""
     points = move_points(world_from_asset, mesh.vertices)
     low, high = points.min(0), points.max(0)
     centre, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-12)
     return similarity(np.eye(3), -centre / radius, 1 / radius)
 
 
-def _moved(mesh: Mesh, unit_from_asset) -> Mesh:
+def moved_mesh(mesh: Mesh, unit_from_asset) -> Mesh:
     """The mesh, with smooth normals where it has none, in the unit frame."""
     m = np.asarray(unit_from_asset, np.float64)
     normals = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64) @ (m[:3, :3] / scale_of(m)).T
     return replace(mesh, vertices=move_points(m, mesh.vertices).astype(np.float32), normals=normals.astype(np.float32))
 
 
-def _shape(mesh: Mesh, bsdf, with_tangents: bool):
+def mitsuba_mesh(mesh: Mesh, bsdf, with_tangents: bool):
+    """Mitsuba's mesh of a mesh with normals. with_tangents: as attributes, for normal maps."""
     props = mi.Properties()
     props["mesh_bsdf"] = bsdf
     out = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), props, True, mesh.uvs is not None)
@@ -109,11 +111,11 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
         raise UserError("the material has a normal map but the mesh has no texture coordinates", fix="give it uvs, or drop the map")
     world_from_asset = np.eye(4) if world_from_asset is None else np.asarray(world_from_asset, np.float64)
     t = {
-        "base_color": _texture(material.base_color, color=True),
-        "roughness": _texture(material.roughness),
-        "metallic": _texture(material.metallic),
-        "specular": None if material.specular is None else _texture(material.specular, color=True),
-        "normalmap": None if material.normal is None else _texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),
+        "base_color": mitsuba_texture(material.base_color, color=True),
+        "roughness": mitsuba_texture(material.roughness),
+        "metallic": mitsuba_texture(material.metallic),
+        "specular": None if material.specular is None else mitsuba_texture(material.specular, color=True),
+        "normalmap": None if material.normal is None else mitsuba_texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),
     }
     if bsdf == "relit":
         d = {"type": relit_bsdf.register(), "int_ior": float(material.ior), **{k: v for k, v in t.items() if v is not None}}
@@ -124,9 +126,9 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
         if t["normalmap"] is not None:
             d = {"type": "normalmap", "normalmap": t["normalmap"], "bsdf": d}
         d = {"type": "twosided", "bsdf": d}
-    unit_from_world = _unit_from_world(mesh, world_from_asset)
-    unit = _moved(mesh, unit_from_world @ world_from_asset)
-    shape = _shape(unit, mi.load_dict(d), t["normalmap"] is not None)
+    unit_from_world = unit_ball(mesh, world_from_asset)
+    unit = moved_mesh(mesh, unit_from_world @ world_from_asset)
+    shape = mitsuba_mesh(unit, mi.load_dict(d), t["normalmap"] is not None)
     scene = {"type": "scene", "object": shape}
     if environment is not None:
         scene["environment"] = {"type": "envmap", "bitmap": mi.Bitmap(environment_bitmap(environment))}
@@ -135,10 +137,10 @@ def build_scene(mesh: Mesh, material: Material, world_from_asset=None, environme
 
 def build_geometry(mesh: Mesh):
     """A Mitsuba scene of the mesh alone, in its own frame, for ray queries (no material, no light)."""
-    return mi.load_dict({"type": "scene", "object": _shape(mesh, mi.load_dict({"type": "diffuse"}), False)})
+    return mi.load_dict({"type": "scene", "object": mitsuba_mesh(mesh, mi.load_dict({"type": "diffuse"}), False)})
 
 
-def _camera_rays(scene: Scene, camera: Camera, sampler, count: int):
+def camera_rays(scene: Scene, camera: Camera, sampler, count: int):
     """`count` rays (sample-major: pixel = index mod W * H) through uniformly jittered positions (a box filter), in the unit frame;
     also the cosine to the optical axis, which turns distance into depth."""
     if camera.distortion and np.any(np.asarray(camera.distortion)):
@@ -155,7 +157,7 @@ def _camera_rays(scene: Scene, camera: Camera, sampler, count: int):
     return mi.RayDifferential3f(mi.Point3f(m[0][3], m[1][3], m[2][3]), dr.normalize(d)), inv
 
 
-def _passes(camera: Camera, spp: int, seed: int):
+def sample_passes(camera: Camera, spp: int, seed: int):
     """(sampler, samples per pixel) of each pass of a rendering, with the memory of one pass bounded."""
     pixels = camera.width * camera.height
     per_pass = max(1, min(spp, RAYS_PER_PASS // pixels))
@@ -178,8 +180,8 @@ def render(scene: Scene, camera: Camera, *, spp: int, seed: int = 0, max_depth: 
         path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True})
     total = np.zeros((pixels, 4))
     with dr.suspend_grad():
-        for sampler, n in _passes(camera, spp, seed):
-            ray, _ = _camera_rays(scene, camera, sampler, n * pixels)
+        for sampler, n in sample_passes(camera, spp, seed):
+            ray, _ = camera_rays(scene, camera, sampler, n * pixels)
             if scene.origins is None:
                 color, hit, _ = path.sample(scene.mi_scene, sampler, ray)
             else:
@@ -202,8 +204,8 @@ def render_channels(scene: Scene, camera: Camera, spp: int = 16, seed: int = 0) 
     total = np.zeros((pixels, 10))
     t = scene.textures
     with dr.suspend_grad():
-        for sampler, n in _passes(camera, spp, seed):
-            ray, cos = _camera_rays(scene, camera, sampler, n * pixels)
+        for sampler, n in sample_passes(camera, spp, seed):
+            ray, cos = camera_rays(scene, camera, sampler, n * pixels)
             si = scene.mi_scene.ray_intersect(ray)
             hit = si.is_valid()
             normal = si.to_world(mi.Vector3f(relit_bsdf.shading_normal(si, t["normalmap"], hit)))

@@ -12,7 +12,7 @@ import numpy as np
 from relit.cameras.se3 import rotation_from
 from relit.conventions import move_points, scale_of
 from relit.geometry.tangents import vertex_normals
-from relit.rendering.mitsuba_scene import Scene, _camera_rays
+from relit.rendering.mitsuba_scene import Scene, camera_rays
 from relit.scene import Camera, Ground, Material, Mesh
 
 LEAST_ROWS = 512  # of each half of a stacked texture: the blend between the halves is one texel wide
@@ -98,7 +98,7 @@ def instance_ids(scene: Scene, pile: Pile, camera: Camera, samples: int = 9) -> 
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, 1000 + k), pixels)
         with dr.suspend_grad():
-            ray, _ = _camera_rays(scene, camera, sampler, pixels)
+            ray, _ = camera_rays(scene, camera, sampler, pixels)
             pi = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
             which = dr.select(pi.is_valid(), pi.prim_index // pile.faces_each, pile.count)
         votes[index, np.minimum(which.numpy().astype(np.int64), pile.count)] += 1

@@ -33,7 +33,7 @@ def start_features(level: np.ndarray) -> np.ndarray:
 def shade(m: Marched, d, reflections):
     """Radiance premultiplied with opacity (Color3f) and the unit normal (Vector3f) of each ray."""
     F = m.features
-    n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
+    n = m.unit_normal
     r = d - 2 * dr.dot(d, n) * n
     r = mi.Vector3f(r.x, dr.clip(r.y, -0.9999, 0.9999), r.z)  # the polar angle's slope has no bound at the poles
     e = dr.exp(lookup_latlong(reflections, ROWS, COLUMNS, r))

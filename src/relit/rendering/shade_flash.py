@@ -22,7 +22,7 @@ from relit.materials.rough_plastic import MIN_ALPHA, Coat, Plastic, evaluate
 from relit.rendering.march import Marched, march, sphere_interval
 
 NODES = 24  # of the alpha grid, a side
-START_ALPHA, START_SPECULAR = 0.25, 0.5
+START_ALPHA = 0.25
 OFFSET_RATE, ALPHA_RATE = 0.05, 0.08  # of the pass's rate of what is learnt besides the features
 LEAVE = 3.0  # voxels along the normal before the shadow ray begins
 
@@ -58,8 +58,8 @@ class FlashAppearance:
 
     def __call__(self, m: Marched, rays, cameras, learnt):
         F = m.features
-        n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
-        x = rays.o + rays.d * (m.depth / dr.maximum(m.opacity, 0.05))
+        n = m.unit_normal
+        x = m.surface_point(rays.o, rays.d)
         offset = mi.Vector3f(*[dr.gather(mi.Float, learnt, mi.UInt32(k)) for k in range(3)])
         position = light_position(cameras, rays.view, offset)
         l, inverse = incident(position, x)

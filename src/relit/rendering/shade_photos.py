@@ -31,7 +31,7 @@ def start_photo_lights(tints: np.ndarray, grey: float) -> tuple:
 def shade_photos(m: Marched, rays, cameras, learnt):
     """The appearance itself: see `fit.volume.VolumeModel.appearance`."""
     F, d = m.features, rays.d
-    n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
+    n = m.unit_normal
     r = d - 2 * dr.dot(d, n) * n
     first = rays.view * (EACH // 3)
 

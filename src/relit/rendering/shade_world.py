@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.lighting.environment import lookup_latlong
+from relit.materials import intrinsic
 from relit.rendering.march import Marched
 from relit.rendering.shade import COLUMNS, ROWS, features_at
 
@@ -59,7 +60,7 @@ def shade_world(m: Marched, rays, cameras, learnt, turns=None):
     """The appearance itself: see `fit.volume.VolumeModel.appearance`. turns: Float, 9 a view, the rotation (by rows) from its photo's
     axes to those of the light, where views come from several photos; None where they come from one."""
     F = m.features
-    n = m.normal * dr.rsqrt(dr.maximum(dr.squared_norm(m.normal), 1e-8))
+    n = m.unit_normal
     d = rays.d
     r = d - 2 * dr.dot(d, n) * n
     turned, mirrored = in_photo(cameras, rays.view, n), in_photo(cameras, rays.view, r)
@@ -68,7 +69,7 @@ def shade_world(m: Marched, rays, cameras, learnt, turns=None):
         turned, mirrored = (mi.Vector3f(*[dr.dot(row, v) for row in k]) for v in (turned, mirrored))
     mirrored = mi.Vector3f(mirrored.x, dr.clip(mirrored.y, -0.9999, 0.9999), mirrored.z)
     e = dr.exp(lookup_latlong(learnt, ROWS, COLUMNS, mirrored))
-    x = rays.o + d * (m.depth / dr.maximum(m.opacity, 0.05))
+    x = m.surface_point(rays.o, d)
     a = [dr.gather(mi.Float, learnt, SHADE + rays.view * 4 + k) for k in range(4)]
     shadow = dr.exp(a[0] + a[1] * x.x + a[2] * x.y + a[3] * x.z)
     diffuse = mi.Color3f(dr.maximum(F[0], 0), dr.maximum(F[1], 0), dr.maximum(F[2], 0))
@@ -89,9 +90,7 @@ def instance_radiance(
     `photo_from_object`, and (N, 3) their colour without light, up to scale. features: (rows, CHANNELS)."""
     values, flat = features_at(grid, features, points), np.array(learnt)
     n = normals @ np.asarray(photo_from_object)[:3, :3].T
-    x, y, z = n.T
-    basis = np.stack([np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1)
-    s = np.exp(basis @ flat[MAP:SHADE].reshape(9, 3))
+    s = np.exp(intrinsic.harmonics(n) @ flat[MAP:SHADE].reshape(9, 3))
     a = flat[SHADE + 4 * view : SHADE + 4 * view + 4]
     shadow = np.exp(a[0] + points @ a[1:])
     mirror = np.exp(flat[:MAP]).mean()

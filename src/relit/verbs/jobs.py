@@ -1,4 +1,4 @@
-"""doctor, demo, inspect, reconstruct: flags, and the function that each calls. Heavy imports stand inside the functions."""
+"""doctor, demo, inspect, reconstruct, quadrants: flags, and the function that each calls. Heavy imports stand inside the functions."""
 
 from __future__ import annotations
 

@@ -20,7 +20,8 @@ def evaluate_flags(parser: Parser) -> None:
 
 def do_evaluate(args) -> None:
     from relit.device import use_device
-    from relit.evaluate.protocols import evaluate, table
+    from relit.evaluate.protocols import evaluate
+    from relit.evaluate.results import table
     from relit.files import write_text
 
     use_device(args.device)

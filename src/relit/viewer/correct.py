@@ -23,7 +23,7 @@ SIDE = 1280  # pixels, longest side of what is painted on
 def correction_server(capture: Capture, port: int = 0) -> Server:
     """A server of the page for this capture; what is saved there counts when the capture is opened the next time."""
     photos = (*capture.photos, *capture.held_out)
-    root = capture.root if capture.root.is_dir() else capture.root.parent
+    root = capture.folder
     may_cut = capture.kind != "duplicates"  # one box knows one object, and the mask of a pile is of all
 
     def index(query: str) -> Photo:

@@ -77,7 +77,7 @@ def ask_in_terminal(
 ) -> Path:
     """Ask for every photo that has no answer yet; an empty line takes the guess, or skips the photo where there is none; 'q' stops. Each
     answer is saved at once."""
-    root, guesses = _root(capture), guesses or {}
+    root, guesses = capture.folder, guesses or {}
     answers = read_answers(root)
     say(EXPLAINED)
     todo = [p.name for p in (*capture.photos, *capture.held_out) if Path(p.name).name not in answers]
@@ -107,7 +107,7 @@ def ask_in_terminal(
 
 def quadrant_server(capture: Capture, port: int = 0, guesses: Mapping[str, list[str]] | None = None) -> Server:
     """A server of the page; every answer is saved at once. guesses: shown as chosen, until Enter makes them answers."""
-    photos, root, guesses = (*capture.photos, *capture.held_out), _root(capture), guesses or {}
+    photos, root, guesses = (*capture.photos, *capture.held_out), capture.folder, guesses or {}
 
     def state() -> dict:
         answers = read_answers(root)
@@ -134,10 +134,6 @@ def quadrant_server(capture: Capture, port: int = 0, guesses: Mapping[str, list[
     server = open_port(lambda: Server(root, {"quadrants": state}, {"answer": keep}, {"photo.jpg": photo}, port), port)
     server.page = PAGE.encode()
     return server
-
-
-def _root(capture: Capture) -> Path:
-    return capture.root if capture.root.is_dir() else capture.root.parent
 
 
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Quadrants</title>
