@@ -228,7 +228,7 @@ def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, m
     monkeypatch.setattr(plan, "open_input", lambda path, job: replace(opened, kind="flash"))
     monkeypatch.delitem(plan.RECIPES, "flash", raising=False)
     code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
-    assert code == 2 and "--capture flash is not available" in err
+    assert code == 2 and "--capture flash is not known" in err
     monkeypatch.setitem(plan.RECIPES, "flash", "stand_in_recipe")
     assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--set", "steps=5")[0] == 0
     assert CALLS == [(5, True)] and load_asset(tmp_path / "run").meta["capture"] == "flash"
