@@ -34,6 +34,7 @@ def test_poses_that_were_refused_are_refused_again(tmp_path, monkeypatch):
 
 class Resumed(NoStage):
     def __init__(self, saved):
+        super().__init__()
         self.saved = saved
 
     def load(self, name):
