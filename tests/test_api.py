@@ -53,7 +53,7 @@ def test_relight_and_export(asset, tmp_path):
     assert [f.suffix for f in files] == [".png"] and files[0].is_file()
     for name in ("a.glb", "a.obj", "a.ply"):
         assert asset.export(tmp_path / name).is_file()
-    with pytest.raises(UserError, match="not known"):
+    with pytest.raises(UserError, match="cannot be told from the ending"):
         asset.export(tmp_path / "a.fbx")
 
 

@@ -59,15 +59,14 @@ class AssetFolder:
             return [Image.open(f).copy() for f in files if f.suffix == ".png"]
 
     def export(self, out: str | Path, format: str | None = None) -> Path:
-        """Another form of the asset (`relit export`): glb, obj, ply, mitsuba or html, by default told by the ending. Returns the file."""
+        """Another form of the asset (`relit export`): glb, obj, ply, mitsuba, gaussians (its light alone, .json) or html, by default told
+        by the ending. Returns the file."""
         from relit.asset.export import export_asset
-        from relit.errors import EXIT_USAGE, UserError
+        from relit.asset.forms import form_of
         from relit.viewer.export_html import export_html
 
         out = Path(out)
-        kind = format or out.suffix.lower().lstrip(".")
-        if kind not in ("glb", "obj", "ply", "mitsuba", "html"):
-            raise UserError(f"the form '{kind}' is not known", fix="give format= glb, obj, ply, mitsuba or html", code=EXIT_USAGE)
+        kind = form_of(out, format)
         if kind == "html":
             export_html(self.run, out)
         else:

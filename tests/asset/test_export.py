@@ -9,7 +9,9 @@ import pytest
 from relit.asset.asset import save_asset
 from relit.asset.export import export_asset, write_mitsuba
 from relit.asset.gltf import read_asset_file
+from relit.conventions import environment_directions, environment_solid_angles, rotate_environment
 from relit.errors import UserError
+from relit.lighting.spherical_gaussians import environment_of, read_json
 from relit.rendering.mitsuba_scene import build_scene, render
 from relit.scene import Flash
 
@@ -31,6 +33,31 @@ def test_glb_and_obj_are_the_same_object(folder, tmp_path):
     for key in ("base_color", "roughness", "metallic", "normal"):
         assert np.abs(getattr(t, key) - getattr(t2, key)).max() < 0.01
     assert t2.ior == pytest.approx(1.33)
+
+
+def test_gaussians_light_the_object_from_where_the_environment_did(asset, tmp_path):
+    light = np.full((16, 32, 3), 0.2, np.float32)
+    light[3:6, 4:8] = (6.0, 4.0, 2.0)  # a window, in the world frame
+    light[9:11, 20:22] = (0.5, 2.0, 4.0)
+    export_asset(save_asset(tmp_path / "asset", replace(asset, environment=light)), "gaussians", tmp_path / "light.json")
+    lobes = read_json(tmp_path / "light.json")
+    assert len(lobes.sharpness) == 128
+    found = rotate_environment(environment_of(lobes, 32, 64), asset.world_from_asset)
+    assert not np.allclose(asset.world_from_asset[:3, :3], np.diag(np.diag(asset.world_from_asset[:3, :3])))  # a turn that could be lost
+    faces = np.concatenate([np.eye(3), -np.eye(3)])
+
+    def irradiance(map_):
+        d = environment_directions(*map_.shape[:2]).reshape(-1, 3)
+        energy = (map_ * environment_solid_angles(*map_.shape[:2])[..., None]).reshape(-1, 3)
+        return np.maximum(faces @ d.T, 0) @ energy
+
+    assert np.abs(irradiance(found) / irradiance(light) - 1).max() < 0.08
+
+
+def test_an_asset_without_an_environment_has_no_gaussians(asset, tmp_path):
+    folder = save_asset(tmp_path / "asset", replace(asset, environment=None, flash=Flash(np.zeros(3), np.ones(3))))
+    with pytest.raises(UserError, match="no environment light"):
+        export_asset(folder, "gaussians", tmp_path / "light.json")
 
 
 def test_ply_has_the_colours(folder, tmp_path):

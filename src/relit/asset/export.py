@@ -1,4 +1,4 @@
-"""Other forms of an asset: GLB, OBJ, PLY with vertex colours, a Mitsuba scene folder."""
+"""Other forms of an asset: GLB, OBJ, PLY with vertex colours, a Mitsuba scene folder; its light as spherical Gaussians."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from relit.asset.asset import find_asset, load_asset, save_textures
+from relit.asset.forms import form_of
 from relit.asset.mitsuba_plastic import flash_emitter, plastic_bsdf
 from relit.asset.obj import write_obj
-from relit.conventions import srgb_from_linear, world_from_mitsuba_camera
-from relit.errors import UserError, did_you_mean
+from relit.conventions import rotate_environment, srgb_from_linear, world_from_mitsuba_camera
+from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals
 from relit.images import write_bytes, write_linear
+from relit.lighting.spherical_gaussians import fit_spherical_gaussians, write_json
 from relit.rendering.mitsuba_scene import environment_bitmap
 from relit.scene import Asset, Material, Mesh
 
-SUFFIXES = {"glb": ".glb", "obj": ".obj", "ply": ".ply", "mitsuba": ""}
+LOBES = 128  # of the light as spherical Gaussians: SfD Eq. (2)
 
 
 def export_asset(folder_or_run: str | Path, format: str, out: str | Path) -> list[Path]:
-    """Write the asset as `format`: 'glb', 'obj' (with .mtl and textures beside it), 'ply' (vertex colours, sRGB) or 'mitsuba' (a folder
-    with scene.xml). All in the asset frame, but for 'mitsuba', which is in the world frame with the first camera and the light.
+    """Write the asset as `format`: 'glb', 'obj' (with .mtl and textures beside it), 'ply' (vertex colours, sRGB), 'mitsuba' (a folder
+    with scene.xml) or 'gaussians' (the environment as LOBES spherical Gaussians, a light for `relit relight`). All in the asset frame, but
+    for 'mitsuba', which is in the world frame with the first camera and the light.
 
     Returns the files written. Raises UserError for an unknown format, a wrong suffix, or a folder that holds something else.
     """
-    if format not in SUFFIXES:
-        raise UserError(f"unknown format '{format}'.{did_you_mean(format, SUFFIXES)}", fix=f"choose {', '.join(SUFFIXES)}", code=2)
     out = Path(out)
-    if format != "mitsuba" and out.suffix.lower() != SUFFIXES[format]:
-        raise UserError(f"the output of format '{format}' must end in {SUFFIXES[format]}", fix=f"rename it: {out}", code=2)
+    if form_of(out, format) == "html":
+        raise UserError("a page is no form of the asset's files", fix="relit.viewer.export_html.export_html writes it")
     folder = find_asset(folder_or_run)
     asset = load_asset(folder)
     if format == "mitsuba":
@@ -42,10 +43,21 @@ def export_asset(folder_or_run: str | Path, format: str, out: str | Path) -> lis
         if not (out.exists() and out.samefile(folder / "object.glb")):
             shutil.copyfile(folder / "object.glb", out)
         return [out]
+    if format == "gaussians":
+        return [write_gaussians(out, asset)]
     if format == "obj":
         return write_obj(out, asset.mesh, asset.material)
     write_ply(out, replace(asset.mesh, uvs=None), vertex_colors(asset.mesh, asset.material))
     return [out]
+
+
+def write_gaussians(path: Path, asset: Asset) -> Path:
+    """The recovered environment as LOBES spherical Gaussians in the asset frame. Raises UserError where the asset has none."""
+    if asset.environment is None:
+        raise UserError("the asset has no environment light", "its light is a flash, or was not kept", "choose another format")
+    light = rotate_environment(asset.environment, np.linalg.inv(asset.world_from_asset))
+    write_json(path, fit_spherical_gaussians(light, LOBES))
+    return path
 
 
 def vertex_colors(mesh: Mesh, material: Material) -> np.ndarray:

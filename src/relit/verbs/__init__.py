@@ -28,7 +28,7 @@ VERBS: dict[str, Verb] = {
     "inspect": Verb("what an input is recognised as, and what a reconstruction would take", inspect_flags, do_inspect),
     "quadrants": Verb("asks where each photo of a collection was taken from", quadrants_flags, do_quadrants),
     "reconstruct": Verb("photos into a relightable asset; giving the same command again resumes", reconstruct_flags, do_reconstruct),
-    "export": Verb("the asset as glb, obj, ply, a Mitsuba scene, or a page to send", export_flags, do_export),
+    "export": Verb("the asset as glb, obj, ply, a Mitsuba scene or a page to send; its light as Gaussians", export_flags, do_export),
     "relight": Verb("pictures of the asset under another light", relight_flags, do_relight),
     "edit": Verb("the asset with another material or an instance less, and the photo so changed", edit_flags, do_edit),
     "insert": Verb("a model put into the photo of a duplicates run, under the recovered light", insert_flags, do_insert),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from relit.asset.forms import SUFFIXES, form_of
 from relit.errors import EXIT_USAGE, UserError
 from relit.verbs.parser import DEVICES, Parser, free, out_flag, path_in
 
@@ -12,16 +13,13 @@ from relit.verbs.parser import DEVICES, Parser, free, out_flag, path_in
 def export_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
     out_flag(parser, "file (or folder, for mitsuba) to write")
-    forms = ("glb", "obj", "ply", "mitsuba", "html")
-    parser.common.add_argument("--format", choices=forms, default=None, help="default: by the ending of -o")
+    parser.common.add_argument("--format", choices=tuple(SUFFIXES), default=None, help="default: by the ending of -o")
     parser.more.add_argument("--overwrite", action="store_true", help="replace an existing file")
     parser.more.add_argument("--no-photos", action="store_true", help="html: leave the photos out, a smaller file")
 
 
 def do_export(args) -> None:
-    kind = args.format or {".glb": "glb", ".obj": "obj", ".ply": "ply", ".html": "html"}.get(args.out.suffix.lower())
-    if kind is None:
-        raise UserError("the form cannot be told from the ending of -o", fix="add --format glb, obj, ply, mitsuba or html", code=EXIT_USAGE)
+    kind = form_of(args.out, args.format)
     free(args.out, args.overwrite)
     if kind == "html":
         from relit.viewer.export_html import export_html
