@@ -1,0 +1,148 @@
+"""Memory stays flat over 500 steps of every pass, and its steps launch the kernels that the first ones compiled."""
+
+from __future__ import annotations
+
+import gc
+import io
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import drjit as dr
+import flash_ball as scene
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from relit.fit.collection_surface import LightOptions, fit_collection_surface, start_collection_surface
+from relit.fit.flash import rates_by_step
+from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
+from relit.fit.instances import hold_distances, move_poses
+from relit.fit.kinship import start_kinship
+from relit.fit.loop import NoStage
+from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
+from relit.fit.volume import VolumeOptions, fit_volume, start_model
+from relit.geometry.sdf import node_positions
+from relit.lighting.gaussian_light import GaussianLight
+from relit.materials.field import start_material
+from relit.materials.plastic_field import start_plastic
+from relit.materials.rough_plastic import Coat
+from relit.rendering.shade_flash import FlashAppearance, start_learnt
+from relit.rendering.shade_photos import shade_photos, start_photo_lights
+from relit.rendering.shade_world import shade_world, start_world_light
+
+STEPS, SETTLED, LAST = 500, 150, 490
+TEXELS = 8
+VOLUME = {"levels": (16,), "steps": (STEPS,), "rays": 64}
+SURFACE = {"steps": STEPS, "points": 32, "directions": 4, "texture": TEXELS}
+
+
+@pytest.fixture(scope="module")
+def shot(device):
+    """(bank, cameras, mesh, textures) of a ball."""
+    return scene.capture(size=16, count=4)
+
+
+def ball_model():
+    """A volume model of the ball."""
+    values = np.linalg.norm(node_positions(16), axis=-1) - 0.7
+    return start_model(values.astype(np.float32), np.full(3, 0.3), None, full=False)
+
+
+def flash_volume(shot, stage):
+    """With the offset moving from half way on, and soft shadows."""
+    model = ball_model()
+    model.reflections, rates = start_learnt()
+    model.rates = rates_by_step(rates, STEPS // 2)
+    model.appearance = FlashAppearance(Coat(), scene.INTENSITY, 16)
+    model.appearance.model = model
+    fit_volume(shot[0], model, VolumeOptions(**VOLUME), stage)
+
+
+def flash_surface(shot, stage):
+    """With inter-reflection, features, and the patches of PIR."""
+    bank, cameras, mesh, _ = shot
+    one = np.ones((TEXELS, TEXELS), np.float32)
+    features = np.random.default_rng(0).random((TEXELS, TEXELS, 4)).astype(np.float32)
+    kinship = start_kinship(features, one > 0, np.stack([0.5 * one, 0.3 * one], -1), groups=4)
+    field = start_plastic(np.full((TEXELS, TEXELS, 3), 0.3), 0.5 * one, 0.3 * one)
+    model = FlashModel(field, mi.Float(features.ravel()), kinship, mi.Float(0, 0, 0), mi.Float([1.5]), Coat())
+    fit_flash_surface(bank, cameras, mesh, model, FlashSurfaceOptions(STEPS, 128, 1, 1, patches=0.1, share_every=45), stage)
+
+
+def collection_volume(shot, stage):
+    """A light for each photo; cameras and focal lengths move. The poses' own descents and those of held-out photos are such fits too."""
+    bank, *_ = shot
+    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    model = ball_model()
+    model.reflections, model.rates = start_photo_lights(np.full((bank.views, 3), 0.3), 0.3)
+    model.appearance = shade_photos
+    model.extra["correction_rates"] = mi.Float(np.ones(7 * bank.views, np.float32))
+    fit_volume(bank, model, VolumeOptions(**VOLUME, refine_cameras=0.003), stage)
+
+
+def collection_surface(shot, stage):
+    """The lights of held-out photos alone are found by less of the same step."""
+    bank, _, mesh, _ = shot
+    material = start_material(TEXELS, np.full((TEXELS, TEXELS, 3), ALBEDO_START, np.float32), 0.5, 0.05)
+    model = start_collection_surface(material, np.full((bank.views, 3), 0.3), ALBEDO_START)
+    fit_collection_surface(bank, mesh, model, SurfaceOptions(**SURFACE), LightOptions(anchor=0.1), stage)
+
+
+def duplicates_volume(shot, stage):
+    """Shape and poses together, the distances held after a while."""
+    bank, *_ = shot
+    model = ball_model()
+    model.appearance = shade_world
+    model.reflections, model.rates = start_world_light(0.3, bank.views)
+    move_poses(bank, model)
+    options = VolumeOptions((12, 16), (SETTLED // 3, STEPS - SETTLED // 3), 64, refine_cameras=0.004, hold=40)
+    fit_volume(bank, model, options, stage, 0, hold_distances)
+
+
+def duplicates_surface(shot, stage):
+    """Under spherical Gaussians."""
+    bank, _, mesh, _ = shot
+    o = SurfaceOptions(**SURFACE, light=8, scale_power=1.0)
+    known = np.ones((TEXELS, TEXELS), bool)
+    model = start_surface(np.full((TEXELS, TEXELS, 3), 0.3, np.float32), known, 0.3, o)
+    model.gaussians = GaussianLight(6, o.light, 0.3 / ALBEDO_START)
+    fit_surface(bank, mesh, model, o, stage)
+
+
+class Watch(NoStage):
+    """Counts what lives after SETTLED and LAST steps, and the kernels of those that follow."""
+
+    def __init__(self):
+        self.alive: dict[int, tuple[int, int, float]] = {}
+        self.kernels: list[dict] = []
+
+    def step(self, i, **losses):
+        if i in (SETTLED, LAST):
+            gc.collect()
+            said = io.StringIO()
+            with redirect_stdout(said):
+                dr.whos()
+            resident = int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
+            self.alive[i] = len(said.getvalue().splitlines()), sys.getallocatedblocks(), resident
+        if i == LAST:  # from here on: the history takes memory itself
+            dr.set_flag(dr.JitFlag.KernelHistory, True)
+            dr.kernel_history_clear()
+        if i == STEPS:
+            self.kernels = dr.kernel_history()
+            dr.set_flag(dr.JitFlag.KernelHistory, False)
+
+
+PASSES = [flash_volume, flash_surface, collection_volume, collection_surface, duplicates_volume, duplicates_surface]
+
+
+@pytest.mark.parametrize("run", PASSES, ids=lambda f: f.__name__)
+def test_memory_stays_flat(shot, run, monkeypatch):
+    monkeypatch.setattr("relit.fit.collection_surface.HISTORY", 100)  # full once the pass has settled
+    watch = Watch()
+    run(shot, watch)
+    arrays, objects, resident = (b - a for a, b in zip(watch.alive[SETTLED], watch.alive[LAST], strict=True))
+    assert arrays <= 2  # Dr.Jit's variables; what a step leaves behind counts 340 times
+    assert objects < 0.9 * (LAST - SETTLED)  # of Python
+    assert resident < 6  # MB, of everything
+    assert len(watch.kernels) >= 10 and all(k["cache_hit"] for k in watch.kernels if "cache_hit" in k)

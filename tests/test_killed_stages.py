@@ -1,0 +1,187 @@
+"""Small jobs of each kind, killed in the stages that a capture with cameras and masks does not have; and done whole where there is no
+network, 2 GB of memory, and folders with odd names."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_machine_faults import JOB, TINY, collection_photos, flash_photos
+
+from relit.asset.asset import load_asset
+from relit.cameras.se3 import camera_errors
+from relit.capture import open_capture
+from relit.errors import UserError
+from relit.plan import Job
+from relit.reconstruct import with_cameras
+from relit.run import Run
+
+sys.path.insert(0, str(Path(__file__).parent / "cameras"))
+
+# no checkpoint is too early; killed at the third that the stage of a name saves, or at its end, before it is called done
+DOOMED = """
+import contextlib, os, sys, relit.run as run
+run.CHECKPOINT_SECONDS = run.CHECKPOINT_LONGEST = 0.0
+doomed, saved, begin, save = sys.argv.pop(1), [], run.Run.stage, run.Stage.save
+def counted(self, name, /, **arrays):
+    save(self, name, **arrays)
+    saved.extend([name] * (self.name == doomed))
+    if len(saved) == 3:
+        os.kill(os.getpid(), 9)
+@contextlib.contextmanager
+def stage(self, name, **about):
+    with begin(self, name, **about) as entered:
+        yield entered
+        if name == doomed:
+            os.kill(os.getpid(), 9)
+run.Stage.save, run.Run.stage = counted, stage
+"""
+# a filter of system calls: the process, and all that it starts, native code as well, dies at the first socket of a network
+OFFLINE = """
+import ctypes, struct
+rules = [(0x20, 0, 0, 4), (0x15, 0, 5, 0xC000003E), (0x20, 0, 0, 0), (0x15, 0, 3, 41)]  # x86-64, socket(
+rules += [(0x20, 0, 0, 16), (0x15, 1, 0, 1), (0x06, 0, 0, 0x80000000), (0x06, 0, 0, 0x7FFF0000)]  # AF_UNIX is allowed
+code = ctypes.create_string_buffer(b"".join(struct.pack("<HBBI", *rule) for rule in rules))
+program = ctypes.create_string_buffer(struct.pack("<HxxxxxxQ", len(rules), ctypes.addressof(code)))
+libc = ctypes.CDLL(None)
+assert libc.prctl(38, 1, 0, 0, 0) == 0 and libc.prctl(22, 2, program, 0, 0) == 0
+"""
+# true poses stand in for the search of a pile's
+TOLD = """
+import os
+if "TRUE_POSES" in os.environ:
+    import numpy, relit.fit.duplicates_poses as poses
+    poses.place = lambda views, *_, **__: (numpy.load(os.environ["TRUE_POSES"]), numpy.full(len(views), 0.95))
+    poses.ambiguous = lambda views, *_, **__: numpy.zeros(len(views))
+"""
+
+
+def limited():
+    resource.setrlimit(resource.RLIMIT_DATA, (2 << 30, 2 << 30))
+
+
+def room_photos(folder: Path) -> tuple[Path, list[str]]:
+    """A corner of a room without cameras."""
+    from test_sfm import arc, photo
+
+    from relit.images import write_data, write_srgb
+
+    for i, camera in enumerate(arc()):
+        rgb, mask = photo(camera)
+        write_srgb(folder / "images" / f"{i}.png", rgb)
+        write_data(folder / "masks" / f"{i}.png", mask)
+    return folder, ["--capture", "multiview"]
+
+
+def unmasked_photos(folder: Path) -> tuple[Path, list[str]]:
+    from test_faults import write_capture
+
+    return write_capture(folder), ["--masks", "none", "--set", "background=16", "--set", "explore_steps=20"]
+
+
+def pile_photo(folder: Path) -> tuple[Path, list[str]]:
+    """Four pawns."""
+    from relit.asset.gltf import write_glb
+    from relit.capture.procedural import pawn
+    from relit.capture.synthetic_duplicates import synthesize_duplicates
+    from relit.images import write_linear
+
+    sys.path.insert(0, str(Path(__file__).parent / "fit"))
+    from test_duplicates_recipe import true_poses
+
+    folder.mkdir(parents=True)
+    write_glb(folder / "pawn.glb", *pawn(rows=16, columns=20, texture=32))
+    write_linear(folder / "light.exr", np.linspace(0.2, 2.0, 8 * 16 * 3).reshape(8, 16, 3).astype(np.float32))
+    sizes = {"count": 4, "seed": 3, "resolution": 96, "test_resolution": 16, "spp": 8, "test_spp": 1, "test_views": 1}
+    synthesize_duplicates(folder / "pawn.glb", folder / "light.exr", folder / "photo", **sizes)
+    np.save(folder / "poses.npy", true_poses(folder / "photo"))
+    return folder / "photo", ["--set", "without=matching", "--set", "side=48"]
+
+
+def collection_with_held_out(folder: Path) -> tuple[Path, list[str]]:
+    photos, words = collection_photos(folder)
+    words[words.index("without=links")] = "holdout=5"
+    return photos, words
+
+
+def words_of(photos: Path, flags: list[str], run: Path) -> list[str]:
+    tiny = [w for k, v in TINY.items() if k != "light" for w in ("--set", f"{k}={v}")]
+    return ["reconstruct", str(photos), "-o", str(run), "--quality", "draft", "--device", "cpu", *tiny, *flags]
+
+
+def job(prelude: str, *words: str, prepare=None):
+    told = next((p for w in words for p in [Path(w).with_name("poses.npy")] if p.is_file()), None)
+    env = dict(os.environ) if told is None else {**os.environ, "TRUE_POSES": str(told)}
+    command = [sys.executable, "-c", prelude + TOLD + JOB, *words]
+    return subprocess.run(command, capture_output=True, timeout=300, preexec_fn=prepare, env=env)
+
+
+def done(run: Path) -> dict[str, int]:
+    return {p.parent.name: p.stat().st_mtime_ns for p in (run / "stages").glob("*/DONE")}
+
+
+JOBS = [
+    (room_photos, ["cameras"]),
+    (unmasked_photos, ["explore"]),
+    (flash_photos, ["volume", "mesh"]),
+    (pile_photo, ["poses", "volume", "surface"]),
+    (collection_with_held_out, ["links", "poses", "second_look", "held_out"]),
+]
+
+
+@pytest.mark.parametrize("make, stages", JOBS, ids=lambda v: v.__name__ if callable(v) else None)
+def test_kill_9_in_one_stage_after_the_other(tmp_path, make, stages):
+    photos, flags = make(tmp_path / "Fotos für später (1)")
+    whole, run = tmp_path / "ein Lauf ✓", tmp_path / "run"
+    first = job(OFFLINE, *words_of(photos, flags, whole), prepare=limited)
+    assert first.returncode == 0, first.stderr.decode()
+    paths = [p for p in whole.rglob("*") if p.is_file() and str(tmp_path).encode() in p.read_bytes()]
+    assert [p.name for p in paths] == ["log.txt"]  # what was said; all else can be moved
+    before: dict[str, int] = {}
+    for stage in stages:
+        killed = job(DOOMED, stage, *words_of(photos, flags, run))
+        assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+        finished = done(run)
+        assert stage not in finished and before.items() <= finished.items() and not (run / "asset").exists()
+        before = finished
+    last = job("", *words_of(photos, flags, run))
+    assert last.returncode == 0, last.stderr.decode()
+    assert set(done(run)) == set(done(whole)) and not list(run.rglob("*.part"))
+    same(load_asset(whole), load_asset(run))
+
+
+def same(a, b) -> None:
+    """Two assets of one job: cameras, instances, shape and colours."""
+    if len(a.cameras) > 2:
+        angle, distance = camera_errors(*(np.array([c.world_from_camera for _, c in x.cameras]) for x in (a, b)))
+        assert np.median(angle) < 1 and np.median(distance) < 0.05 * np.ptp(b.mesh.vertices)
+    for x, y in zip(a.instances, b.instances, strict=True):
+        assert x.label == y.label and x.registered == y.registered
+        assert not x.registered or np.allclose(x.world_from_object, y.world_from_object, atol=0.2)
+    assert np.allclose(np.ptp(a.mesh.vertices, axis=0), np.ptp(b.mesh.vertices, axis=0), rtol=0.1)
+    colours = [m.base_color if m.diffuse is None else m.diffuse for m in (a.material, b.material)]
+    assert np.allclose(*(c.mean((0, 1)) for c in colours), atol=0.05)
+
+
+def test_a_network_is_noticed():
+    """The test above proves nothing if this fails."""
+    for reach in ("import socket\nsocket.socket()", "import subprocess, sys\nsubprocess.run([sys.executable, '-c', INNER], check=True)"):
+        code = OFFLINE + "INNER = 'import socket; socket.socket()'\nimport socket\nsocket.socket(socket.AF_UNIX)\n" + reach
+        assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode != 0
+
+
+def test_cameras_that_a_run_has_found_are_not_found_anew(tmp_path):
+    """They would stand in a frame of their own, and what later stages have kept would not fit."""
+    photos, _ = room_photos(tmp_path / "photos")
+    with Run.open(tmp_path / "run", {}) as run:
+        with run.stage("cameras") as stage:
+            (stage.folder / "found.json").write_text("{")
+        with pytest.raises(UserError, match="cameras that this run has found cannot be read") as error:
+            with_cameras(open_capture(photos), run, Job())
+    assert "--overwrite" in error.value.fix
