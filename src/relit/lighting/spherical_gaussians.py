@@ -175,7 +175,7 @@ def read_json(path: str | Path) -> SphericalGaussians:
         finite = np.isfinite(axis).all() and np.isfinite(amplitude).all() and np.isfinite(sharpness).all()
         if not finite or (length < 1e-6).any() or (sharpness <= 0).any() or (amplitude < 0).any():
             raise ValueError("axis, sharpness or amplitude of a lobe makes no sense")
-    except (OSError, KeyError, TypeError, ValueError, RecursionError) as e:
+    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as e:
         fix = f'it must hold {{"lobes": [{{"axis": [x, y, z], "sharpness": s, "amplitude": [r, g, b]}}]}}: {path}'
         raise UserError("the file holds no spherical Gaussians", f"{type(e).__name__}: {e}", fix) from None
     return SphericalGaussians(axis / length, sharpness, amplitude)
