@@ -1,9 +1,13 @@
 """Photos without masks: the whole scene first, then a shape from its depths, then the volume pass before the fitted background."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lump import cameras, distance_to_truth, lump, write_cameras
 
+from relit.asset.asset import save_asset
+from relit.asset.gltf import has_border
 from relit.capture import open_capture
 from relit.conventions import environment_directions, move_points, sample_environment
 from relit.evaluate.photos import directions
@@ -54,3 +58,13 @@ def test_a_shape_is_found_without_masks(photos, tmp_path):
     assert (tmp_path / "run/stages/explore/DONE").exists()
     vertices = move_points(asset.world_from_asset, asset.mesh.vertices)
     assert distance_to_truth(vertices) < 0.02
+
+
+def test_photos_of_one_side_leave_the_other_side_open(photos, tmp_path):
+    capture = open_capture(photos, masks="none", sphere=Sphere(np.zeros(3), 0.75))
+    upper = tuple(p for p in capture.photos if p.camera.centre[1] > -0.6)
+    with Run.open(tmp_path / "run", {}) as run:
+        asset = reconstruct(replace(capture, photos=upper), run, OPTIONS, 0)
+    assert has_border(asset.mesh)
+    path = save_asset(tmp_path / "asset", asset)
+    assert b'"doubleSided"' in (path / "object.glb").read_bytes()

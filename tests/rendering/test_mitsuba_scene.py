@@ -118,6 +118,18 @@ def test_principled_agrees_on_a_matte_ball():
     assert a[inside].mean() == pytest.approx(b[inside].mean(), rel=0.04)
 
 
+@pytest.mark.parametrize("bsdf", ["relit", "principled"])
+def test_both_sides_of_a_surface_have_its_material(bsdf):
+    """A ball whose faces and normals look inwards looks like the ball: meshes of photos without masks are open."""
+    light = np.random.default_rng(1).random((4, 8, 3)).astype(np.float32)
+    ball = sphere()
+    inside_out = replace(ball, faces=np.ascontiguousarray(ball.faces[:, ::-1]), normals=-ball.normals)
+    a, b = (render(build_scene(m, plain(0.5, 0.4, 0.5), None, light, bsdf=bsdf), look_at((0, 0, 3)), spp=64) for m in (ball, inside_out))
+    covered = a[..., 3] == 1
+    assert b[covered].mean() == pytest.approx(a[covered].mean(), rel=0.01)
+    assert np.abs(a - b)[covered].mean() < 0.05 * a[covered].mean()
+
+
 def test_inter_reflection_adds_light_and_shadows_take_it():
     """A valley: its two sides light each other and keep each other from the sky."""
     v = np.array([[-1, 1, 1], [-1, 1, -1], [0, 0, 1], [0, 0, -1], [1, 1, 1], [1, 1, -1]], np.float32)

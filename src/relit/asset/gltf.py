@@ -134,8 +134,17 @@ def _pbr(doc: _Document, m: Material) -> dict:
     return p
 
 
+def has_border(mesh: Mesh) -> bool:
+    """Whether some edge belongs to one face only; vertices at the same place count as one."""
+    _, place = np.unique(np.asarray(mesh.vertices), axis=0, return_inverse=True)
+    faces = place.reshape(-1)[np.asarray(mesh.faces)]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 1).any())
+
+
 def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=None, name: str = "object", instances=()) -> None:
-    """Write a binary glTF 2.0 file, atomically: one node, one primitive, NORMAL always, TANGENT with a normal map.
+    """Write a binary glTF 2.0 file, atomically: one node, one primitive, NORMAL always, TANGENT with a normal map. An open mesh (of photos
+    without masks) is doubleSided.
 
     root_transform: (4, 4) matrix of the node, or None: the file's coordinates are root_transform @ mesh. Textures are 8-bit PNGs
     (base colour and specular colour in sRGB); an array with one value becomes a factor. Material.specular becomes specularColor of
@@ -165,6 +174,8 @@ def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=N
     mesh = replace(mesh, normals=(normals / length).astype(np.float32))
     attributes = {"POSITION": doc.accessor(mesh.vertices, bounds=True), "NORMAL": doc.accessor(mesh.normals)}
     m: dict = {"name": name, "pbrMetallicRoughness": _pbr(doc, material)}
+    if has_border(mesh):
+        m["doubleSided"] = True
     if material.normal is not None:
         m["normalTexture"] = doc.texture(_data_png(np.asarray(material.normal) * 0.5 + 0.5))
         attributes["TANGENT"] = doc.accessor(vertex_tangents(mesh))

@@ -3,7 +3,8 @@
     photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
     hull       visual hull of the masks, or without masks the fused depths of a radiance field of the whole scene   fit/explore.py
     volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
-    mesh       zero level set, decimated; outlines as the masks have them; texture atlas; mean radiance per vertex   fit/outlines.py
+    mesh       zero level set, decimated; outlines as the masks have them, or without masks what the photos see; texture atlas;
+               mean radiance per vertex                                                              fit/outlines.py, fit/unseen.py
     surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/first_material.py, fit/surface.py
     asset      textures with filled gutters, everything back in the frame of the user's cameras
 """
@@ -29,6 +30,7 @@ from relit.fit.outlines import follow_outlines
 from relit.fit.pixels import PixelBank, corrected, place_cameras, sphere_pixels
 from relit.fit.placing import placed_mesh
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
+from relit.fit.unseen import without_unseen
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -266,12 +268,12 @@ def score_held_out(capture: Capture, model: VolumeModel, run, unit_from_found: n
 
 
 def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: MultiviewOptions) -> dict[str, np.ndarray]:
-    """Mesh, its outlines where the masks have them, atlas, and the mean radiance of each vertex. Returns (and keeps) vertices, faces,
-    normals, uvs, radiance."""
+    """Mesh, its outlines where the masks have them, or without masks no more than the photos see, atlas, and the mean radiance of each
+    vertex. Returns (and keeps) vertices, faces, normals, uvs, radiance."""
     with run.stage("mesh", title="mesh and atlas") as stage:
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
-        if masks is not None:
-            mesh = follow_outlines(mesh, found_cameras(cameras, run, options), masks, options.outlines)
+        found = found_cameras(cameras, run, options)
+        mesh = without_unseen(mesh, found) if masks is None else follow_outlines(mesh, found, masks, options.outlines)
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
