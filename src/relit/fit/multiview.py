@@ -52,7 +52,8 @@ STAGES = ("volume", "mesh", "surface")
 
 @dataclass(frozen=True)
 class MultiviewOptions:
-    """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass. rays: per step. hollows: flat faces of the
+    """levels, level_steps: nodes a side and optimisation steps of each level of the volume pass; a surface moves by a few nodes a level, so
+    it takes a coarse one to get from the hull into a concave side. rays: per step. hollows: flat faces of the
     visual hull that are asked whether they are lids (fit/lids.py). max_pixels: photos are shrunk until all together have no more.
     refine_cameras: step of the camera corrections in the volume pass (0: cameras are exact). normal: weight of normal priors read from
     files. background, explore_steps: nodes a side of the radiance field for photos without masks, and the steps that fit it.
@@ -62,8 +63,8 @@ class MultiviewOptions:
     of WITHOUT.
     """
 
-    levels: tuple[int, ...] = (128, 256)
-    level_steps: tuple[int, ...] = (500, 500)
+    levels: tuple[int, ...] = (48, 128, 256)
+    level_steps: tuple[int, ...] = (200, 400, 400)
     rays: int = 8192
     hollows: int = 3
     max_pixels: int = 24_000_000
@@ -120,8 +121,8 @@ PRESETS = {
     },
     "standard": {},
     "high": {
-        "levels": (128, 256),
-        "level_steps": (800, 1000),
+        "levels": (48, 128, 256),
+        "level_steps": (300, 700, 800),
         "max_pixels": 60_000_000,
         "background": 128,
         "explore_steps": 800,
