@@ -34,7 +34,7 @@ from relit.fit.unseen import without_unseen
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.hull import visual_hull
+from relit.geometry.hull import thin_parts, visual_hull
 from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.materials.field import normal_map, pictures
@@ -64,7 +64,7 @@ class MultiviewOptions:
     """
 
     levels: tuple[int, ...] = (48, 128, 256)
-    level_steps: tuple[int, ...] = (200, 400, 400)
+    level_steps: tuple[int, ...] = (150, 450, 500)
     rays: int = 8192
     hollows: int = 3
     max_pixels: int = 24_000_000
@@ -122,7 +122,7 @@ PRESETS = {
     "standard": {},
     "high": {
         "levels": (48, 128, 256),
-        "level_steps": (300, 700, 800),
+        "level_steps": (200, 750, 950),
         "max_pixels": 60_000_000,
         "background": 128,
         "explore_steps": 800,
@@ -211,7 +211,7 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
             explore(bank, field, options.explore_steps, options.rays // 2, stage, seed)
             stage.save("field", step=options.explore_steps, cells=np.array(field.cells))
     with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
-        n = options.levels[0]
+        n, mend = options.levels[0], None
         if masks is not None:
             try:
                 values = visual_hull(cameras, masks, n)
@@ -222,13 +222,9 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
                     "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or --masks none to do without masks",
                     code=4,
                 ) from None
-            if options.hollows > 0 and not stage.load("checkpoint"):
-                coarse = visual_hull(cameras, masks, FIRST.nodes)
-                fresh = partial(start_model, level=level, background=None, full=True)
-                show = run.progress("hollows that no silhouette shows")
-                found = open_lids(bank, cameras, coarse, fresh, run.say, seed, options.hollows, progress=show)
-                values = without(values, found)
-            model = start_model(values, level, None, full=False)
+            hollows = sought_hollows(bank, cameras, masks, level, run, stage, options, seed) if options.hollows > 0 else None
+            model = start_model(without(values, hollows), level, None, full=False)
+            mend = partial(with_details, cameras=cameras, masks=masks, hollows=hollows, voxel=2 / (n - 1))
         else:
             try:
                 values = first_shape(bank, cameras, field, n)
@@ -240,8 +236,27 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
                     code=4,
                 ) from None
             model = start_model(values, level, field, full=False)
-        fit_volume(bank, model, volume_options(options), stage, seed)
+        fit_volume(bank, model, volume_options(options), stage, seed, mend=mend)
     return model
+
+
+def sought_hollows(bank: PixelBank, cameras: list[Camera], masks, level, run, stage, options: MultiviewOptions, seed: int):
+    """What `fit.lids.open_lids` takes away from the visual hull, (n, n, n) distances or None; kept in the stage."""
+    saved = stage.load("hollows")
+    if saved is None:
+        coarse = visual_hull(cameras, masks, FIRST.nodes)
+        fresh = partial(start_model, level=level, background=None, full=True)
+        show = run.progress("hollows that no silhouette shows")
+        found = open_lids(bank, cameras, coarse, fresh, run.say, seed, options.hollows, progress=show)
+        saved = {"distances": np.zeros((0, 0, 0), np.float32) if found is None else found}
+        stage.save("hollows", **saved)
+    return saved["distances"] if saved["distances"].size else None
+
+
+def with_details(values: np.ndarray, cameras: list[Camera], masks, hollows, voxel: float) -> np.ndarray:
+    """Distances (n, n, n) after the first level, with what its voxels were too large for: thin parts of the hull, and the hollows."""
+    thin = thin_parts(visual_hull(cameras, masks, values.shape[0]), voxel)
+    return without(values if thin is None else np.minimum(values, thin), hollows)
 
 
 def score_held_out(capture: Capture, model: VolumeModel, run, unit_from_found: np.ndarray) -> None:

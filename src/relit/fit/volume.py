@@ -91,8 +91,12 @@ def start_model(values: np.ndarray, level: np.ndarray, background: Background | 
     return VolumeModel(grid, start_reflections(float(level.mean())), background)
 
 
-def next_level(model: VolumeModel, n: int, band: float) -> None:
-    """Carry the field to n nodes a side: resample, make it a distance again, cut a new band."""
+Mend = Callable[[np.ndarray], np.ndarray]
+
+
+def next_level(model: VolumeModel, n: int, band: float, mend: Mend | None = None) -> None:
+    """Carry the field to n nodes a side: resample, make it a distance again, cut a new band. mend: distances (n, n, n) -> with what the
+    coarser grid could not hold."""
     old = model.grid
     features = np.zeros((old.n**3, old.channels), np.float32)
     rows = row_features(old)
@@ -101,6 +105,8 @@ def next_level(model: VolumeModel, n: int, band: float) -> None:
     known[np.array(old.nodes)] = True
     features = _fill_unknown(features.reshape(old.n, old.n, old.n, -1), known.reshape(old.n, old.n, old.n))
     values = redistance(resample(dense_values(old), n))
+    if mend is not None:
+        values = redistance(mend(values))
     model.grid = make_grid(values, old.channels, band=band, features=resample(features, n))
 
 
@@ -121,9 +127,11 @@ def fit_volume(
     stage,
     seed: int = 0,
     begin_level: Callable[[VolumeModel], None] | None = None,
+    mend: Mend | None = None,
 ) -> VolumeModel:
     """Run all levels; returns the same model, optimised. Resumes from the stage's checkpoint when there is one. begin_level: called with
-    the model before every level but the first, and where a level is taken up again."""
+    the model before every level but the first, and where a level is taken up again. mend: after the first level,
+    see `next_level`."""
     done = 0
     saved = stage.load("checkpoint")
     start = int(saved["step"]) if saved else 0
@@ -135,7 +143,7 @@ def fit_volume(
         if saved and start > done:
             restore_model(model, bank, saved)
         elif model.grid.n != n:
-            next_level(model, n, options.band)
+            next_level(model, n, options.band, mend if number == 1 else None)
         if start >= done + steps:
             break
         if begin_level is not None and number > 0:
