@@ -10,7 +10,7 @@ from relit.fit.volume import next_level, start_model
 from relit.geometry.atlas import cells, unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.fusion import fuse_depths
-from relit.geometry.hull import distance_of, thin_parts, visual_hull
+from relit.geometry.hull import distance_of, visual_hull
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, make_grid, node_positions, redistance, resample, smoothness_gradient
 from relit.scene import Camera
@@ -163,22 +163,13 @@ def test_gutters_take_the_nearest_value():
     assert (fill_gutters(texture, known) == 5).all()
 
 
-def test_thin_parts_are_what_sticks_out():
-    """An antenna is found, whole but for its foot; edges and corners of a thick body are no parts of their own."""
-    p = node_positions(96)
-    body = np.abs(p).max(-1) < 0.3
-    antenna = (np.abs(p[..., :2]).max(-1) < 0.03) & (p[..., 2] > 0) & (p[..., 2] < 0.8)
-    assert thin_parts(distance_of(body), 2 / 47) is None
-    found = thin_parts(distance_of(body | antenna), 2 / 47) < 0
-    assert found[antenna & (p[..., 2] > 0.38)].all() and not found[~antenna].any()
-    assert (thin_parts(distance_of(antenna), 2 / 47) < 0)[antenna].all()
-
-
-def test_thin_parts_come_back_at_the_second_level():
+def test_the_second_level_begins_with_what_is_mended():
     p = node_positions(64)
-    thin = distance_of((np.abs(p[..., :2]).max(-1) < 0.03) & (np.abs(p[..., 2]) < 0.8))
+    hollow = distance_of(np.linalg.norm(p - [0, 0, 0.3], axis=-1) < 0.2)
     model = start_model(np.linalg.norm(node_positions(24), axis=-1).astype(np.float32) - 0.3, np.full(3, 0.5), None, full=False)
-    next_level(model, 64, 5.0, lambda values: np.minimum(values, thin))
+    next_level(model, 64, 5.0, lambda values: np.maximum(values, -hollow))
     values = dense_values(model.grid)
-    assert (values < 0)[thin < -0.01].all() and (values < 0)[np.linalg.norm(p, axis=-1) < 0.27].all()
-    assert (np.array(model.grid.index).reshape(values.shape) > 0)[(thin < 0) & (np.linalg.norm(p, axis=-1) > 0.35)].all()  # optimised too
+    inside = (np.linalg.norm(p, axis=-1) < 0.27) & (hollow > 0.03)
+    assert (values < 0)[inside].all() and (values >= 0)[hollow < 0].all()
+    rim = (np.linalg.norm(p, axis=-1) < 0.3) & (np.abs(hollow) < 0.02)
+    assert (np.array(model.grid.index).reshape(values.shape) > 0)[rim].all()  # and it is optimised there

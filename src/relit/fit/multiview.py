@@ -34,7 +34,7 @@ from relit.fit.unseen import without_unseen
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.hull import thin_parts, visual_hull
+from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.materials.field import normal_map, pictures
@@ -64,7 +64,7 @@ class MultiviewOptions:
     """
 
     levels: tuple[int, ...] = (48, 128, 256)
-    level_steps: tuple[int, ...] = (150, 450, 500)
+    level_steps: tuple[int, ...] = (200, 400, 400)
     rays: int = 8192
     hollows: int = 3
     max_pixels: int = 24_000_000
@@ -122,7 +122,7 @@ PRESETS = {
     "standard": {},
     "high": {
         "levels": (48, 128, 256),
-        "level_steps": (200, 750, 950),
+        "level_steps": (300, 700, 800),
         "max_pixels": 60_000_000,
         "background": 128,
         "explore_steps": 800,
@@ -224,7 +224,7 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
                 ) from None
             hollows = sought_hollows(bank, cameras, masks, level, run, stage, options, seed) if options.hollows > 0 else None
             model = start_model(without(values, hollows), level, None, full=False)
-            mend = partial(with_details, cameras=cameras, masks=masks, hollows=hollows, voxel=2 / (n - 1))
+            mend = partial(without, hollows=hollows)  # its rim and walls are finer than the first level's voxels
         else:
             try:
                 values = first_shape(bank, cameras, field, n)
@@ -251,12 +251,6 @@ def sought_hollows(bank: PixelBank, cameras: list[Camera], masks, level, run, st
         saved = {"distances": np.zeros((0, 0, 0), np.float32) if found is None else found}
         stage.save("hollows", **saved)
     return saved["distances"] if saved["distances"].size else None
-
-
-def with_details(values: np.ndarray, cameras: list[Camera], masks, hollows, voxel: float) -> np.ndarray:
-    """Distances (n, n, n) after the first level, with what its voxels were too large for: thin parts of the hull, and the hollows."""
-    thin = thin_parts(visual_hull(cameras, masks, values.shape[0]), voxel)
-    return without(values if thin is None else np.minimum(values, thin), hollows)
 
 
 def score_held_out(capture: Capture, model: VolumeModel, run, unit_from_found: np.ndarray) -> None:

@@ -95,8 +95,8 @@ Mend = Callable[[np.ndarray], np.ndarray]
 
 
 def next_level(model: VolumeModel, n: int, band: float, mend: Mend | None = None) -> None:
-    """Carry the field to n nodes a side: resample, make it a distance again, cut a new band. mend: distances (n, n, n) -> with what the
-    coarser grid could not hold."""
+    """Carry the field to n nodes a side: resample, make it a distance again, cut a new band. mend: distances (n, n, n) -> what the next
+    level begins with."""
     old = model.grid
     features = np.zeros((old.n**3, old.channels), np.float32)
     rows = row_features(old)

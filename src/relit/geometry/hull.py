@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
-from scipy.ndimage import maximum as largest_of
+from scipy.ndimage import distance_transform_edt
 
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
-STICKS_OUT = 2.5  # of the radius: what is thin counts where it reaches so far from what is thick, or else it is an edge
 
 def visual_hull(cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, *, tolerance: float = 1 / 30) -> np.ndarray:
     """Signed distance (n, n, n) float32 [z, y, x] of the visual hull over [-1, 1]^3.
@@ -43,20 +41,3 @@ def distance_of(inside: np.ndarray) -> np.ndarray:
     if not inside.any() or inside.all():
         raise ValueError("the occupancy is empty or full")
     return ((distance_transform_edt(~inside) - distance_transform_edt(inside)) * h).astype(np.float32)
-
-
-def thin_parts(values: np.ndarray, radius: float) -> np.ndarray | None:
-    """Signed distance (n, n, n) of the parts of a shape, given by its own, that no ball of `radius` fits into and that stick out of the
-    rest: antennas, legs, handles, which a grid of that voxel loses. None where there are none."""
-    h = 2.0 / (values.shape[0] - 1)
-    inside = values < 0
-    core = distance_transform_edt(inside) * h > radius
-    if not core.any():
-        return distance_of(inside) if inside.any() else None
-    out = distance_transform_edt(~core) * h - radius  # from what a ball reaches
-    parts, count = label(inside & (out > 0), np.ones((3, 3, 3)))
-    if count == 0:
-        return None
-    long = np.flatnonzero(largest_of(out, parts, np.arange(1, count + 1)) > STICKS_OUT * radius) + 1
-    kept = np.isin(parts, long)
-    return distance_of(kept) if kept.any() else None
