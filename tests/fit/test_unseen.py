@@ -7,7 +7,8 @@ import trimesh
 from lump import cameras, lump
 
 from relit.asset.gltf import has_border
-from relit.fit.unseen import face_areas, seen_faces, without_unseen
+from relit.fit.unseen import seen_faces, without_unseen
+from relit.geometry.mesh import face_areas
 from relit.geometry.tangents import vertex_normals
 from relit.scene import Mesh
 

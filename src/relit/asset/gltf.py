@@ -14,7 +14,7 @@ from relit import __version__
 from relit.asset.gltf_read import read_gltf
 from relit.asset.obj import read_obj
 from relit.errors import UserError
-from relit.geometry.tangents import vertex_normals, vertex_tangents
+from relit.geometry.tangents import edges, vertex_normals, vertex_tangents
 from relit.images import encode_png, write_bytes
 from relit.scene import Material, Mesh
 
@@ -138,8 +138,8 @@ def has_border(mesh: Mesh) -> bool:
     """Whether some edge belongs to one face only; vertices at the same place count as one."""
     _, place = np.unique(np.asarray(mesh.vertices), axis=0, return_inverse=True)
     faces = place.reshape(-1)[np.asarray(mesh.faces)]
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 1).any())
+    sides = np.sort(edges(faces), axis=1)
+    return bool((np.unique(sides, axis=0, return_counts=True)[1] == 1).any())
 
 
 def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=None, name: str = "object", instances=()) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags, identity
 
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
+from relit.geometry.tangents import edges
 from relit.scene import Mesh
 
 RINGS = 4  # of vertices around each one that share a factor
@@ -32,9 +33,9 @@ class BroadSteps:
         count = int(self.place.max()) + 1
         corner = np.take_along_axis(mesh.faces[np.maximum(self.face, 0)], self.bary.argmax(-1)[..., None], -1)[..., 0]
         self.nearest = np.where(self.known, self.place[corner], 0)
-        edges = self.place[np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])]
-        edges = np.concatenate([edges, edges[:, ::-1]])
-        near = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (count, count)).tocsr()
+        sides = self.place[edges(mesh.faces)]
+        sides = np.concatenate([sides, sides[:, ::-1]])
+        near = coo_matrix((np.ones(len(sides)), (sides[:, 0], sides[:, 1])), (count, count)).tocsr()
         near.data[:] = 1
         near = near + identity(count)
         self.pool = diags(1 / np.asarray(near.sum(1)).ravel()) @ near

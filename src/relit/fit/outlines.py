@@ -20,7 +20,7 @@ from scipy.sparse.linalg import cg
 
 from relit.cameras.se3 import exp_so3
 from relit.fit.pixels import camera_rows, rays_through
-from relit.geometry.tangents import vertex_normals
+from relit.geometry.tangents import edges, vertex_normals
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
@@ -204,7 +204,7 @@ def solve(mesh: Mesh, outlines: list[Outline]) -> np.ndarray:
 
 def laplacian(faces: np.ndarray, count: int):
     """Each vertex less the mean of its neighbours (count, count), sparse."""
-    i, j = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+    i, j = edges(faces).T
     links = coo_matrix((np.ones(2 * len(i)), (np.concatenate([i, j]), np.concatenate([j, i]))), (count, count)).tocsr()
     links.data[:] = 1.0
     degree = np.maximum(np.asarray(links.sum(1)).ravel(), 1)

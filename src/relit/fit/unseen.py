@@ -14,12 +14,13 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from relit.fit.pixels import camera_rows, rays_through
+from relit.geometry.mesh import KEEP, face_areas
+from relit.geometry.tangents import edges
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
 PIXELS = 160_000  # rays through each photo, about
 FILLED = 0.01  # of the mesh's area: unseen parts smaller than this stay
-SPECK = 0.02  # of the largest part's area: seen parts smaller than this go
 RIM = 2  # rings of unseen faces beside seen ones that stay
 
 
@@ -32,7 +33,7 @@ def without_unseen(mesh: Mesh, cameras: list[Camera]) -> Mesh:
         a, b = pairs[:, 0], pairs[:, 1]
         keep[np.concatenate([b[keep[a]], a[keep[b]]])] = True
     parts = part_areas(keep, pairs, areas)
-    keep &= parts >= SPECK * parts.max()
+    keep &= parts >= KEEP * parts.max()
     if not seen.any() or keep.all():
         return mesh
     used, faces = np.unique(mesh.faces[keep], return_inverse=True)
@@ -59,19 +60,13 @@ def seen_faces(mesh: Mesh, cameras: list[Camera]) -> np.ndarray:
     return seen
 
 
-def face_areas(mesh: Mesh) -> np.ndarray:
-    """(F,) areas."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
 def face_pairs(faces: np.ndarray) -> np.ndarray:
     """(E, 2) faces that share an edge."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    sides = np.sort(edges(faces), axis=1)
     owner = np.tile(np.arange(len(faces)), 3)
-    order = np.lexsort(edges.T)
-    edges, owner = edges[order], owner[order]
-    same = (edges[1:] == edges[:-1]).all(1)
+    order = np.lexsort(sides.T)
+    sides, owner = sides[order], owner[order]
+    same = (sides[1:] == sides[:-1]).all(1)
     return np.stack([owner[:-1][same], owner[1:][same]], -1)
 
 

@@ -88,10 +88,14 @@ def field_normals(values: np.ndarray, points: np.ndarray) -> np.ndarray:
     return (g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-9)).astype(np.float32)
 
 
+def face_areas(mesh: Mesh) -> np.ndarray:
+    """(F,) areas."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
 def vertex_areas(mesh: Mesh) -> np.ndarray:
     """(V,) a third of the area of the faces around each vertex."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     out = np.zeros(len(mesh.vertices))
-    np.add.at(out, mesh.faces.ravel(), np.repeat(area, 3))
+    np.add.at(out, mesh.faces.ravel(), np.repeat(face_areas(mesh) / 3, 3))
     return out

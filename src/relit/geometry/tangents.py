@@ -1,4 +1,4 @@
-"""Vertex normals and tangents of a mesh, in NumPy."""
+"""Edges, vertex normals and tangents of a mesh, in NumPy."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ def _unit(x):
     """(N, 3) -> unit rows; zero rows become +Z."""
     length = np.linalg.norm(x, axis=-1, keepdims=True)
     return np.where(length > 1e-20, x / np.maximum(length, 1e-20), np.array([0.0, 0.0, 1.0]))
+
+
+def edges(faces: np.ndarray) -> np.ndarray:
+    """(3 F, 2) vertices of the sides of all faces: first sides 0-1 of all, then sides 1-2, then sides 2-0."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
