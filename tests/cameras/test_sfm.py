@@ -125,6 +125,16 @@ def test_four_photos_of_forty_are_no_capture(folder, tmp_path):
     assert caught.value.code == EXIT_FAILED and "36 have fewer than 150 features" in caught.value.why
 
 
+def test_photos_that_look_apart_are_told_so_without_advice_about_given_poses(tmp_path):
+    for i, x in enumerate(np.linspace(-0.5, 1.0, 5)):  # a walk along a wall, each photo turned away from the middle
+        eye = np.array([x, 0.0, -1.0])
+        pose = look_at(eye, [x + 0.5 * (x - 0.25), 0.0, 1.0], [0, -1, 0])
+        images.write_srgb(tmp_path / f"{i}.png", photo(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))[0])
+    with pytest.raises(UserError, match=r"look away from each other.*found from the photos") as caught:
+        find_cameras(open_capture(tmp_path, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 5)
+    assert caught.value.code == EXIT_FAILED and "do not go around one object" in caught.value.why and "--sphere" not in caught.value.fix
+
+
 def test_two_photos_are_too_few(folder, tmp_path):
     capture = open_capture(folder, masks="none")
     with pytest.raises(UserError, match="2 photos are not enough"):

@@ -85,7 +85,7 @@ def find_cameras(
     say: told what is being done, a line at a time.
     workdir: a folder of its own. The model found stays there: a second call with the same photos reads it instead of searching again.
     The frame is COLMAP's (arbitrary, scale as well).
-    Raises UserError (exit code 4) when fewer than three photos, or 15 % of them, can be registered.
+    Raises UserError (exit code 4) when fewer than three photos, or 15 % of them, can be registered, or the cameras look apart.
     """
     pycolmap = load_pycolmap()
 
@@ -325,7 +325,15 @@ def _sphere(model, names: list[str], small: list[np.ndarray | None]) -> tuple[Sp
     masks = dict(zip(names, small, strict=True))
     images = [model.image(i) for i in model.reg_image_ids()]
     views = [View(*camera_from_colmap(i.camera, world_from_camera(i)), masks[i.name]) for i in images]
-    return find_sphere(views, sparse_points(model))
+    try:
+        return find_sphere(views, sparse_points(model))
+    except UserError as error:  # its advice is about given poses; these were found
+        raise UserError(
+            f"{error.what}; the cameras were found from the photos",
+            "the photos do not go around one object, or the object turned before a still background, which the cameras were found from",
+            "photograph the object from all around, in the middle of every photo; on a turntable use a plain backdrop or masks (--masks)",
+            code=EXIT_FAILED,
+        ) from None
 
 
 def _registered(capture: Capture, model, sphere: Sphere, source: str, verdict: Verdict) -> Capture:
