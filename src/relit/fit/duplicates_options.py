@@ -22,8 +22,8 @@ class DuplicatesOptions:
 
     side: int = 320
     search_rounds: int = 1
-    levels: tuple[int, ...] = (64, 128)
-    level_steps: tuple[int, ...] = (400, 500)
+    levels: tuple[int, ...] = (48, 96, 192)
+    level_steps: tuple[int, ...] = (400, 500, 400)
     rays: int = 6144
     refine_poses: float = 0.004
     faces: int = 16_000
@@ -77,7 +77,7 @@ PRESETS = {
         "max_pixels": 1_000_000,
     },
     "standard": {},
-    "high": {"side": 480, "levels": (96, 192), "level_steps": (500, 700), "texture": 1024, "surface_steps": 2500, "directions": 64},
+    "high": {"side": 480, "level_steps": (500, 600, 700), "texture": 1024, "surface_steps": 2500, "directions": 64},
 }
 
 

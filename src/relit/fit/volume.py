@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.fit.common_motion import without_common_motion
 from relit.fit.loop import Adam, cosine_decay, run_steps
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import PixelBank, RayBatch, batch_of, camera_rows, draw_pixels, rays_through, saturated_at, unlimited, well_exposed
@@ -159,6 +160,9 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
     h, count = grid.h, options.rays
     rng = mi.PCG32(size=count, initstate=seed * 7919 + begin)
     refine = options.refine_cameras > 0 and end > options.hold
+    ratios = model.extra.get("correction_rates")  # Float as wide as the corrections
+    # cameras that stay tell where the scene is
+    held = ratios is not None and not np.array(ratios).reshape(bank.views, -1).any(axis=1).all()
     adam = {
         "sdf": Adam(grid.rows, floor=options.calm),
         "features": Adam(grid.rows * grid.channels),
@@ -222,9 +226,9 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         if model.background is not None:
             model.background.cells = adam["background"].step(dr.detach(model.background.cells), gradients[3], 0.05 * decay)
         if refine:
-            ratio = model.extra.get("correction_rates", 1.0)  # Float as wide as the corrections
             rate = options.refine_cameras * decay if i >= options.hold else 0.0
-            bank.corrections = camera_adam.step(dr.detach(bank.corrections), gradients[-1], rate, ratio)
+            moved = camera_adam.step(dr.detach(bank.corrections), gradients[-1], rate, 1.0 if ratios is None else ratios)
+            bank.corrections = moved if held else without_common_motion(moved, bank.cameras)
         dr.eval(grid.row_values)
         write_rows(grid)
         return report
