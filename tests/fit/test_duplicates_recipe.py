@@ -21,6 +21,7 @@ from relit.errors import UserError
 from relit.evaluate.protocols import evaluate
 from relit.fit import duplicates as recipe
 from relit.fit import duplicates_poses as poses_stage
+from relit.fit import odd_instances as odd
 from relit.images import write_linear
 from relit.run import Run
 
@@ -140,6 +141,64 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     told = evaluate(tmp_path / "run", real, spp=4)["metrics"]
     for name in ("rotation_median", "rotation_pairs", "registered", "rotation_before"):
         assert told[name]["value"] == pytest.approx(metrics[name]["value"], abs=1e-6)
+
+
+SMALL = {"levels": (24,), "level_steps": (60,), "rays": 1024, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
+
+
+def small_options(**changes):
+    return replace(recipe.options_for("draft"), **{**SMALL, **changes}, directions=8, light=8, side=64)
+
+
+def test_what_a_wrongly_placed_instance_shows_stands_out(pile, tmp_path):
+    capture, options = open_capture(pile), small_options()
+    shots = [(p.load(), p.camera.with_pose(np.eye(4))) for p in capture.photos]
+    views, poses = poses_stage.all_views(shots, options.side, options), true_poses(pile)
+    wrong = poses.copy()
+    wrong[2] = similarity(exp_so3(np.radians([110.0, 0, 0])), np.zeros(3)) @ poses[2]
+    errors = []
+    for some, name in ((poses, "right"), (wrong, "wrong")):
+        with Run.open(tmp_path / name, {}) as run, run.stage("volume", steps=60, title="volume") as stage:
+            model, bank, _ = recipe.shape_and_poses(views, some, run, stage, options, 0)
+            errors.append(odd.view_errors(bank, model))
+    assert errors[0].max() < 1.3 * np.median(errors[0])
+    assert errors[1][2] > 1.3 * np.delete(errors[1], 2).max()  # of four in a short fit, the others suffer too
+
+
+def test_odd_instances_are_few_among_many(monkeypatch):
+    def found(errors):
+        monkeypatch.setattr(odd, "view_errors", lambda *_: np.array(errors))
+        return np.flatnonzero(odd.odd_instances(SimpleNamespace(views=len(errors)), None)).tolist()
+
+    assert found([1, 1.2, 0.9, 1.7, 1.1, 6.3]) == [5]
+    assert found([1, 1.2, 0.9, 1.7, 1.1, 1.6]) == []
+    assert found([1, 1.2, 1.1, 6.3]) == []  # too few to tell
+    assert found([1, 1, 1, 1, 6.3, 7]) == []  # so many that the model itself is in doubt
+    assert found([1, np.nan, 1.1, 1, 1, 0.9]) == []
+
+
+def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
+    stand_in(monkeypatch, true_poses(pile))
+    calls = []
+
+    def third(bank, model, seed=0):
+        calls.append(bank.views)
+        return np.arange(bank.views) == 2
+
+    monkeypatch.setattr(recipe, "odd_instances", third)
+    capture, options = open_capture(pile), small_options(level_steps=(12,))
+    with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
+        asset = recipe.reconstruct(capture, run, options, 0)
+        assert calls == [4]  # those that are left are not asked again
+        assert [i.registered for i in asset.instances].count(False) == 1 and len(asset.instances) == 4
+        assert all("agrees too little" in i.reason for i in asset.instances if not i.registered)
+        left_out = run.folder / "stages" / "volume" / "left_out.npz"
+        assert left_out.is_file()
+        for stage in ("volume", "mesh", "surface"):  # stopped in the second pass: what was found in the first stays
+            (run.folder / "stages" / stage / "DONE").unlink()
+        again = recipe.reconstruct(capture, run, options, 0)
+    assert calls == [4] and [i.label for i in again.instances] == [i.label for i in asset.instances]
+    assert "does not agree with the model of all" in (run.folder / "log.txt").read_text()
 
 
 def test_two_photos_of_one_pile(tmp_path, monkeypatch):

@@ -24,10 +24,11 @@ from relit.capture.networks import Network, predicted_normals
 from relit.conventions import move_points, similarity
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions, options_for
-from relit.fit.duplicates_poses import all_views, poses_stage
+from relit.fit.duplicates_poses import all_views, named, poses_stage
 from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.instance_search import Search
 from relit.fit.instances import ANOTHER_PHOTO, View, carved, hold_distances, move_poses, moved_poses, pixel_bank
+from relit.fit.odd_instances import odd_instances
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import (
@@ -114,28 +115,8 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view); motions (P, 4, 4)
     first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances (N,) which of the
     instances it is."""
-    bank = pixel_bank(views, poses)
-    with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
-        inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
-        try:
-            values = carved(views, poses, options.levels[0], 0.15, Search.depth, crossed=True)
-        except ValueError:
-            raise UserError(
-                "the silhouettes have nothing in common",
-                "poses are wrong, or the objects differ",
-                "check the label image",
-                code=EXIT_FAILED,
-            ) from None
-        model = start_model(values, np.maximum(inside.mean(0), 1e-3), None, full=False)
-        scene = related(views, poses, run)
-        model.appearance = shade_world if len(scene.motions) == 1 else partial(shade_world, turns=light_turns(views, scene))
-        model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
-        rate = 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
-        if rate > 0:
-            move_poses(bank, model)
-        o = VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=HOLD)
-        fit_volume(bank, model, o, stage, seed, hold_distances if rate > 0 else None)
-    poses = moved_poses(bank, views, poses)
+    views, poses, model = volume_stage(views, poses, run, options, seed)
+    rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
@@ -180,6 +161,57 @@ def shape_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
         }
         stage.save("mesh", **parts)
     return parts
+
+
+def volume_stage(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
+    """(views, poses, model) after the volume pass. Where what some instances show does not agree with the model of all, they are left out,
+    and the pass is made again without them, from the poses that it had found."""
+    with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
+        left_out = stage.load("left_out")
+        if left_out is None:
+            model, bank, moved = shape_and_poses(views, poses, run, stage, options, seed)
+            odd = odd_instances(bank, model, seed) if pose_rate(views, options) > 0 else np.zeros(len(views), bool)
+            if not odd.any():
+                return views, moved, model
+            stage.save("checkpoint", step=0)  # the second pass begins anew
+            left_out = {"odd": odd, "poses": moved}
+            stage.save("left_out", **left_out)
+        odd = left_out["odd"]
+        for k in np.flatnonzero(odd):
+            run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
+        views = [v for v, out in zip(views, odd, strict=True) if not out]
+        model, _, poses = shape_and_poses(views, left_out["poses"][~odd], run, stage, options, seed)
+        return views, poses, model
+
+
+def pose_rate(views: list[View], options: DuplicatesOptions) -> float:
+    """Step of the pose corrections in the volume pass."""
+    return 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
+
+
+def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: DuplicatesOptions, seed: int):
+    """One volume pass: (model, its pixel bank, poses)."""
+    bank = pixel_bank(views, poses)
+    inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
+    try:
+        values = carved(views, poses, options.levels[0], 0.15, Search.depth, crossed=True)
+    except ValueError:
+        raise UserError(
+            "the silhouettes have nothing in common",
+            "poses are wrong, or the objects differ",
+            "check the label image",
+            code=EXIT_FAILED,
+        ) from None
+    model = start_model(values, np.maximum(inside.mean(0), 1e-3), None, full=False)
+    scene = related(views, poses, run)
+    model.appearance = shade_world if len(scene.motions) == 1 else partial(shade_world, turns=light_turns(views, scene))
+    model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
+    rate = pose_rate(views, options)
+    if rate > 0:
+        move_poses(bank, model)
+    o = VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=HOLD)
+    fit_volume(bank, model, o, stage, seed, hold_distances if rate > 0 else None)
+    return model, bank, moved_poses(bank, views, poses)
 
 
 def related(views: list[View], poses: np.ndarray, run=None) -> Scene:
