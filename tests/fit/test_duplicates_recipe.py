@@ -170,11 +170,11 @@ def test_odd_instances_are_few_among_many(monkeypatch):
         monkeypatch.setattr(odd, "view_errors", lambda *_: np.array(errors))
         return np.flatnonzero(odd.odd_instances(SimpleNamespace(views=len(errors)), None)).tolist()
 
-    assert found([1, 1.2, 0.9, 1.7, 1.1, 6.3]) == [5]
-    assert found([1, 1.2, 0.9, 1.7, 1.1, 1.6]) == []
-    assert found([1, 1.2, 1.1, 6.3]) == []  # too few to tell
-    assert found([1, 1, 1, 1, 6.3, 7]) == []  # so many that the model itself is in doubt
-    assert found([1, np.nan, 1.1, 1, 1, 0.9]) == []
+    assert found([1, 1.2, 0.9, 1.7, 1.1, 6.3, 1, 1]) == [5]
+    assert found([1, 1.2, 0.9, 1.7, 1.1, 1.6, 1, 1]) == []
+    assert found([1, 1.2, 1.1, 6.3, 1, 1]) == []  # too few to tell
+    assert found([1, 1, 1, 1, 1, 1, 6.3, 7]) == []  # so many that the model itself is in doubt
+    assert found([1, np.nan, 1.1, 1, 1, 0.9, 1, 1]) == []
 
 
 def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ from relit.fit.volume import VolumeModel
 from relit.rendering.march import march, sphere_interval
 
 ODD = 4.0  # times the median error of all instances
-LEAST = 6  # instances, below which their median tells little
+LEAST = 8  # instances: of fewer each is needed for the shape, and their median tells little
 MOST = 0.2  # of the instances can be odd
 PROBES = 200_000  # rays
 
