@@ -166,7 +166,7 @@ def same(a, b) -> None:
         assert not x.registered or np.allclose(x.world_from_object, y.world_from_object, atol=0.2)
     assert np.allclose(np.ptp(a.mesh.vertices, axis=0), np.ptp(b.mesh.vertices, axis=0), rtol=0.1)
     colours = [m.base_color if m.diffuse is None else m.diffuse for m in (a.material, b.material)]
-    assert np.allclose(*(c.mean((0, 1)) for c in colours), atol=0.1)  # scale of light against paint, of a fit this short
+    assert np.allclose(*(c.mean((0, 1)) for c in colours), atol=0.05)
 
 
 def test_a_network_is_noticed():
