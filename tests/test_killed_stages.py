@@ -82,7 +82,7 @@ def room_photos(folder: Path) -> tuple[Path, list[str]]:
 def unmasked_photos(folder: Path) -> tuple[Path, list[str]]:
     from test_faults import write_capture
 
-    return write_capture(folder), ["--masks", "none", "--set", "background=16", "--set", "explore_steps=20"]
+    return write_capture(folder), ["--masks", "none", "--set", "background=16", "--set", "explore_steps=100"]
 
 
 def pile_photo(folder: Path) -> tuple[Path, list[str]]:
