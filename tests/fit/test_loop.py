@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 
 
 class Twin:
@@ -78,3 +78,26 @@ def test_the_loop_reports_and_saves_when_it_is_due():
     run_steps(stage, 3, 6, lambda i: {"a": [10.0 * i]}, lambda: {"x": 1})
     assert stage.said == [(4, {"a": 30.0}), (5, {"a": 40.0}), (6, {"a": 50.0})]
     assert stage.saved == [("checkpoint", {"step": 5, "x": 1})]
+
+
+def test_what_is_remembered_goes_on_as_if_nothing_had_happened():
+    def steps(x, rng, adam, count):
+        for _ in range(count):
+            x = adam["x"].step(x, x - rng.next_float32(), 0.1)
+            dr.eval(x, rng)
+        return x
+
+    def begin():
+        return mi.PCG32(size=9, initstate=3), {"x": Adam(9, floor=0.5)}
+
+    rng, adam = begin()
+    half = steps(mi.Float(np.linspace(-1, 1, 9)), rng, adam, 5)
+    kept = memory(rng, adam)
+    whole = np.array(steps(half, rng, adam, 5))
+    rng, adam = begin()
+    recall(kept, rng, adam)
+    np.testing.assert_allclose(np.array(steps(half, rng, adam, 5)), whole, atol=1e-6)
+    rng, adam = begin()
+    recall(None, rng, adam)  # no checkpoint
+    recall({"step": np.array(5)}, rng, adam)  # one without memory
+    assert np.abs(np.array(steps(half, rng, adam, 5)) - whole).max() > 0.05

@@ -88,4 +88,4 @@ def test_kill_9_and_the_same_command_again(capture, whole, tmp_path, stage, afte
     asset = load_asset(reconstruct(capture, run, seed=3, settings=SETTINGS, device="cpu", report=False))
     later = [m["step"] for m in read_metrics(run)[lines:] if m["stage"] == stage]
     assert kept >= 1 and min(later) > kept  # nothing before the checkpoint was done again
-    assert alike(whole, asset) > 30 and shape_error(asset) < 1.3 * shape_error(whole) + 1e-3
+    assert alike(whole, asset) > 36 and shape_error(asset) < 1.3 * shape_error(whole) + 1e-3

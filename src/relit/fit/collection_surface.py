@@ -14,7 +14,7 @@ import numpy as np
 
 from relit.fit.broad_steps import BroadSteps
 from relit.fit.collection_options import CollectionOptions
-from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import PixelBank, saturated_at
 from relit.fit.preview import surface_preview
@@ -111,17 +111,22 @@ def fit_collection_surface(
         material.colour, material.metallic, material.slope = (mi.Float(saved[n]) for n in ("colour", "metallic", "slope"))
         model.coefficients, model.gains, model.weights = saved["coefficients"], saved["gains"], saved["weights"]
         model.losses, running = saved.get("losses", np.zeros(0)).tolist(), saved.get("running", running)
-    rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
+    rng = mi.PCG32(size=count, initstate=seed * 7919 + 13)
     adam_colour, adam_metallic, adam_slope = (Adam(dr.width(p)) for p in (material.colour, material.metallic, material.slope))
     adam_slope.floor = options.slope_calm
     adam_c, adam_g = Adam(model.coefficients.size), Adam(model.gains.size)
     adam_s = Adam(3)
+    adam = {"colour": adam_colour, "metallic": adam_metallic, "slope": adam_slope}
+    adam |= {"coefficients": adam_c, "gains": adam_g, "scale": adam_s}
+    recall(saved, rng, adam)
     ratio = mi.Float(np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2))
     lights = PhotoLights(dr.exp(mi.Float(model.lights().ravel())), views)
     level = mi.Float(begun.astype(np.float32).ravel())  # what arrives on average: for what blocks a direction
     exposure = mi.Float(begun.mean(1).astype(np.float32))
 
     broad = None if frozen or first >= light.broad * options.steps else BroadSteps(mesh.mesh, options.texture)
+    if broad is not None and saved and "broad" in saved:
+        broad.shown, broad.predicted = saved["broad"]
     window = max(5, round(light.window * options.steps))
 
     def step(i: int) -> dict:
@@ -212,7 +217,8 @@ def fit_collection_surface(
     def state() -> dict:
         arrays = {"colour": np.array(material.colour), "metallic": np.array(material.metallic), "slope": np.array(material.slope)}
         arrays |= {"coefficients": model.coefficients, "gains": model.gains, "weights": model.weights}
-        return {**arrays, "losses": np.array(model.losses), "running": running}
+        arrays |= {} if broad is None else {"broad": np.stack([broad.shown, broad.predicted])}
+        return {**arrays, "losses": np.array(model.losses), "running": running, **memory(rng, adam)}
 
     def textures(uv, valid):
         at = material_at(material, uv, valid)

@@ -43,12 +43,13 @@ class Exchange:
         self.bin = mi.UInt32((np.minimum((v * ROWS).astype(int), ROWS - 1) * 2 * ROWS + column).astype(np.uint32))
         self._corners = corners(light_rows, hats)
         self.adam = Adam(3 * self.count)
-        self.share = None
+        self.light = self.share = None
 
     def refresh(self, radiance) -> None:
-        """Follow the light, Float [rows * 2 rows * 3]."""
+        """Follow the light, Float [rows * 2 rows * 3], which `light` keeps."""
+        self.light = dr.detach(radiance)
         texel, weight = self._shrink
-        c = dr.gather(mi.Color3f, dr.detach(radiance), texel)
+        c = dr.gather(mi.Color3f, self.light, texel)
         light = dr.block_sum((c.x + c.y + c.z) * weight, dr.width(texel) // (2 * ROWS * ROWS)) / 3 + 1e-6
         dr.eval(light)
         self.share = shares(self._cosines, self._hats, light, self.count)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_loss
 from relit.fit.pixels import PixelBank, batch_of, draw_pixels, rays_through
 from relit.geometry.fusion import fuse_depths
@@ -28,9 +28,10 @@ def explore(bank: PixelBank, field: Background, steps: int, rays: int, stage, se
     first = int(saved["step"]) if saved else 0
     if saved:
         field.cells = mi.Float(saved["cells"])
-    adam = Adam(dr.width(field.cells))
+    adam = {"cells": Adam(dr.width(field.cells))}
     ratio = mi.Float(np.tile(np.array([2, 0.5, 0.5, 0.5], np.float32), field.n**3))  # densities have farther to go than colours
-    rng = mi.PCG32(size=rays, initstate=seed * 7919 + 5 + first)
+    rng = mi.PCG32(size=rays, initstate=seed * 7919 + 5)
+    recall(saved, rng, adam)
 
     def step(i: int) -> dict:
         pixel = draw_pixels(bank, rng, rays)
@@ -45,11 +46,11 @@ def explore(bank: PixelBank, field: Background, steps: int, rays: int, stage, se
         gradient = dr.grad(field.cells)
         dr.disable_grad(field.cells)
         dr.eval(gradient, loss)
-        field.cells = adam.step(dr.detach(field.cells), gradient, 0.15 * cosine_decay(i / steps, 0.1), ratio)
+        field.cells = adam["cells"].step(dr.detach(field.cells), gradient, 0.15 * cosine_decay(i / steps, 0.1), ratio)
         dr.eval(field.cells)
         return {"colour": loss}
 
-    run_steps(stage, first, steps, step, lambda: {"cells": np.array(field.cells)}, "field")
+    run_steps(stage, first, steps, step, lambda: {"cells": np.array(field.cells), **memory(rng, adam)}, "field")
     return field
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from relit.conventions import srgb_from_linear
 from relit.fit.flash_patches import draw_patches, pyramid_loss, ssim_loss
 from relit.fit.kinship import Kinship, share_evidence
-from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_weight
 from relit.fit.pixels import PixelBank, draw_pixels, saturated_at, well_exposed
 from relit.fit.preview import surface_preview
@@ -101,10 +101,11 @@ def fit_flash_surface(
         field.diffuse, field.lobe, field.slope = (mi.Float(saved[name]) for name in ("diffuse", "lobe", "slope"))
         model.offset, model.log_intensity = mi.Float(saved["offset"]), mi.Float(saved["log_intensity"])
         if model.kinship is not None:
-            model.kinship.level, model.kinship.sums = mi.Float(saved["level"]), saved["sums"]
-    rng = mi.PCG32(size=o.points, initstate=seed * 7919 + 17 + first)
+            model.kinship.take_up(saved["level"], saved["sums"])
+    rng = mi.PCG32(size=o.points, initstate=seed * 7919 + 17)
     adam = {"diffuse": Adam(dr.width(field.diffuse)), "slope": Adam(dr.width(field.slope), floor=o.slope_calm)}
     adam |= {"lobe": Adam(dr.width(field.lobe), floor=o.lobe_calm), "offset": Adam(3), "log_intensity": Adam(1)}
+    recall(saved, rng, adam)
     ratio = mi.Float(np.tile(np.array([o.specular_rate / o.alpha_rate, 1], np.float32), field.size**2))
 
     def step(i: int) -> dict:
@@ -181,7 +182,7 @@ def fit_flash_surface(
         values = {"diffuse": field.diffuse, "lobe": field.lobe, "slope": field.slope}
         values |= {"offset": model.offset, "log_intensity": model.log_intensity}
         values |= {"level": model.kinship.level, "sums": model.kinship.sums} if model.kinship is not None else {}
-        return {name: np.array(value) for name, value in values.items()}
+        return {name: np.array(value) for name, value in values.items()} | memory(rng, adam)
 
     def textures(uv, valid):
         at, _ = plastic_at(field, uv, valid)

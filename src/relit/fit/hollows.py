@@ -12,18 +12,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_propagation, distance_transform_edt, gaussian_filter
 
 from relit.fit.loop import NoStage
-from relit.fit.losses import display_weight
-from relit.fit.pixels import PixelBank, batch_of
+from relit.fit.pixels import PixelBank
+from relit.fit.ray_errors import ray_errors
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import dense_values, node_positions, resample
-from relit.rendering.march import march, sphere_interval
 from relit.scene import Camera
 
 KEEP = (0.3, 0.15, 0.05, 0.0)  # share of the photos in which a node is bare and so stays, turn after turn
@@ -102,30 +99,12 @@ def without(values: np.ndarray, hollows: np.ndarray | None) -> np.ndarray:
 def surface_error(bank: PixelBank, model: VolumeModel, o: HollowOptions, seed: int):
     """(mean error, (n, n, n) mean error of the rays whose surface point is near each node, NaN where there are none)."""
     n = o.nodes
-    value, hit, x = ray_errors(bank, model, o.probes, seed)
-    value, flat = value[hit], nearest_node(x[hit], n)
+    rays = ray_errors(bank, model, o.probes, seed)
+    value, flat = rays.value[rays.hit], nearest_node(rays.x[rays.hit], n)
     value = np.minimum(value, 4 * value.mean())  # highlights
     total, count = (np.bincount(flat, w, n**3).reshape(n, n, n) for w in (value, np.ones_like(value)))
     total, count = gaussian_filter(total, o.blur), gaussian_filter(count, o.blur)
     return float(value.mean()), np.where(count > 0.02, total / np.maximum(count, 1e-9), np.nan)
-
-
-def ray_errors(bank: PixelBank, model: VolumeModel, count: int, seed: int):
-    """Of `count` drawn rays, the same for the same seed: the squared difference of display values (N,), whether the ray shows a whole pixel
-    of the object and meets the surface (N,) bool, and where it meets it (N, 3)."""
-    rng = mi.PCG32(size=count, initstate=seed + 77)
-    with dr.suspend_grad():
-        k = dr.minimum(mi.UInt32(rng.next_float32() * dr.width(bank.candidates)), dr.width(bank.candidates) - 1)
-        batch = batch_of(bank, dr.gather(mi.UInt32, bank.candidates, k))
-        t0, t1 = sphere_interval(batch.o, batch.d)
-        dr.eval(batch.o, batch.d, batch.rgb, batch.mask, batch.view, t0, t1)
-        m = march(model.grid, batch.o, batch.d, t0, t1, dr.opaque(mi.Float, model.inv_s), dr.opaque(mi.Float, model.grid.h))
-        colour, _ = model.shade(m, batch, bank.cameras)
-        r = dr.square(colour - batch.rgb) * display_weight(batch.rgb)
-        value = (r.x + r.y + r.z) / 3
-        hit = (m.opacity > 0.5) & (batch.mask > 0.99) & dr.isfinite(value)
-        x = m.surface_point(batch.o, batch.d)
-        return np.array(value), np.array(hit), np.array(x).T
 
 
 def nearest_node(x: np.ndarray, n: int) -> np.ndarray:

@@ -70,6 +70,12 @@ class Kinship:
         per_group = UNSEEN_OWN + (usual - UNSEEN_OWN) * self.trust
         return self.spread(mi.Float(np.repeat(per_group, 2).astype(np.float32)))
 
+    def take_up(self, level: np.ndarray, sums: np.ndarray) -> None:
+        """Go on from what a checkpoint kept, (groups * 2,) and as `sums`."""
+        self.level, self.sums = mi.Float(level), sums
+        if sums.any():
+            self.trust = highlights_seen(sums)
+
 
 def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, groups: int = 40, width: float = 0.08) -> Kinship:
     """Groups by k-means. features: (S, S, C), distances of about `width` are alike. known: (S, S) bool. lobe: (S, S, 2) start of

@@ -13,9 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label, uniform_filter
 
-from relit.fit.hollows import HollowOptions, briefly_fitted, left_without, nearest_node, ray_errors, skin_of
+from relit.fit.hollows import HollowOptions, briefly_fitted, left_without, nearest_node, skin_of
 from relit.fit.loop import NoStage
 from relit.fit.pixels import PixelBank
+from relit.fit.ray_errors import RayErrors, ray_errors
 from relit.fit.volume import VolumeModel
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions, resample
@@ -55,19 +56,19 @@ def open_lids(
     def errors(v: np.ndarray, o: HollowOptions):
         return ray_errors(bank, briefly_fitted(bank, start(v), o, stage, seed), o.probes, seed)
 
-    known: dict[int, tuple] = {}  # errors of the shape as it is, by nodes
+    known: dict[int, RayErrors] = {}  # errors of the shape as it is, by nodes
 
     def change(trial: np.ndarray, mouth: np.ndarray, o: HollowOptions):
         """What the error of the rays that meet the mouth is multiplied by, in the mean or the median, whichever falls less; the errors."""
         old, new = (v if o is first else resample(v, o.nodes) for v in (values, trial))
         if o.nodes not in known:
             known[o.nodes] = errors(old, o)
-        value, hit, x = known[o.nodes]
-        rays = hit & binary_dilation(mouth).ravel()[nearest_node(x, first.nodes)]
+        now = known[o.nodes]
+        rays = now.hit & binary_dilation(mouth).ravel()[nearest_node(now.x, first.nodes)]
         if rays.sum() < RAYS:
             return np.inf, None
         found = errors(new, o)
-        return max(f(found[0][rays]) / max(f(value[rays]), 1e-12) for f in (np.mean, np.median)), found
+        return max(f(found.value[rays]) / max(f(now.value[rays]), 1e-12) for f in (np.mean, np.median)), found
 
     asked = [(lid, found) for lid in flat_faces(values) if (found := opened_at(hull, lid, some, first))]
     for lid, found in sorted(asked, key=lambda pair: -pair[1][1].sum())[:faces]:

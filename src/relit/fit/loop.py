@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 class Adam:
@@ -34,6 +35,26 @@ class Adam:
         out = parameter - size * ratio * self.m / (dr.sqrt(second * correction) + 1e-12)
         dr.schedule(out, self.m, self.v)
         return out
+
+
+def memory(rng, adam: dict[str, Adam]) -> dict[str, np.ndarray]:
+    """What a checkpoint keeps beside the parameters, so that a fit goes on as if it had not been stopped: the state of the random numbers
+    (PCG32) and the moments of each optimiser."""
+    out = {"rng": np.array(rng.state)}
+    for name, a in adam.items():
+        out |= {f"{name}_m": np.array(a.m), f"{name}_v": np.array(a.v), f"{name}_t": np.array(a.t)}
+    return out
+
+
+def recall(saved: dict[str, np.ndarray] | None, rng, adam: dict[str, Adam]) -> None:
+    """Put back what `memory` kept. What a checkpoint does not hold begins anew."""
+    if not saved:
+        return
+    if "rng" in saved and len(saved["rng"]) == dr.width(rng.state):
+        rng.state = mi.UInt64(saved["rng"])
+    for name, a in adam.items():
+        if f"{name}_t" in saved and len(saved[f"{name}_m"]) == dr.width(a.m):
+            a.m, a.v, a.t = mi.Float(saved[f"{name}_m"]), mi.Float(saved[f"{name}_v"]), int(saved[f"{name}_t"])
 
 
 class NoStage:

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.exchange import REFRESH, Exchange
-from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels, saturated_at
 from relit.fit.preview import surface_preview
@@ -141,10 +141,14 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     environment.radiance = dr.exp(model.log_light)
     environment.rebuild()
     count = options.points
-    rng = mi.PCG32(size=count, initstate=seed * 7919 + 13 + first)
+    rng = mi.PCG32(size=count, initstate=seed * 7919 + 13)
     exchange = Exchange(model.normals, material.size**2, options.light, options.exchange_rows)
     adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, light_parameters(model)))
     adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
+    adam = {"colour": adam_colour, "metallic": adam_metallic, "slope": adam_slope, "light": adam_light, "exchange": exchange.adam}
+    recall(saved, rng, adam)
+    if saved and "followed" in saved:
+        exchange.refresh(mi.Float(saved["followed"]))
     light_steps = min(options.light_steps or options.steps, options.steps)
     ratio = np.tile(np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32), material.size**2)
     ratio = mi.Float(ratio)
@@ -210,7 +214,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             gaussians.project()
             model.log_light = gaussians.log_radiance()
         if options.exchange_rate > 0 and gaussians is None:
-            if i % REFRESH == 0 or i == first:
+            if i % REFRESH == 0 or exchange.share is None:
                 exchange.refresh(environment.radiance)
             dr.eval(material.colour, model.log_light)
             rate, metallic = options.exchange_rate * decay, material.metallic if options.exchange_mirrored else None
@@ -222,7 +226,9 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
 
     def state() -> dict:
         names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": light_parameters(model)}
-        return {name: np.array(value) for name, value in {**names, "metal": model.metal}.items()}
+        arrays = {name: np.array(value) for name, value in {**names, "metal": model.metal}.items()}
+        followed = {} if exchange.light is None else {"followed": np.array(exchange.light)}
+        return arrays | followed | memory(rng, adam)
 
     def textures(uv, valid):
         at = material_at(material, uv, valid)

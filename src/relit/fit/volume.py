@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.common_motion import without_common_motion
-from relit.fit.loop import Adam, cosine_decay, run_steps
+from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import PixelBank, RayBatch, batch_of, camera_rows, draw_pixels, rays_through, saturated_at, unlimited, well_exposed
 from relit.fit.preview import volume_preview
@@ -149,13 +149,14 @@ def fit_volume(
             break
         if begin_level is not None and number > 0:
             begin_level(model)
-        _fit_level(bank, model, options, stage, camera_adam, first=max(start, done), begin=done, end=done + steps, seed=seed)
+        span = {"first": max(start, done), "begin": done, "end": done + steps}
+        _fit_level(bank, model, options, stage, camera_adam, **span, saved=saved, seed=seed)
         done += steps
     stage.save("checkpoint", step=done, **_state(model, bank))  # a stop during the mesh stage need not come back here
     return model
 
 
-def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, seed):
+def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, saved, seed):
     grid = model.grid
     h, count = grid.h, options.rays
     rng = mi.PCG32(size=count, initstate=seed * 7919 + begin)
@@ -167,9 +168,12 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         "sdf": Adam(grid.rows, floor=options.calm),
         "features": Adam(grid.rows * grid.channels),
         "reflections": Adam(dr.width(model.reflections)),
+        "cameras": camera_adam,
     }
     if model.background is not None:
         adam["background"] = Adam(dr.width(model.background.cells))
+    if first > begin:  # the next level has a grid of its own
+        recall(saved, rng, adam)
     dt = dr.opaque(mi.Float, options.step * h)
 
     def step(i: int) -> dict:
@@ -234,7 +238,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         return report
 
     corrections = (lambda: bank.corrections) if refine else None
-    run_steps(stage, first, end, step, lambda: _state(model, bank), preview=volume_preview(bank, model, options.step, corrections))
+    state = lambda: {**_state(model, bank), **memory(rng, adam)}  # noqa: E731
+    run_steps(stage, first, end, step, state, preview=volume_preview(bank, model, options.step, corrections))
 
 
 def render_views(model: VolumeModel, cameras: list[Camera], step: float = 0.9) -> list[np.ndarray]:
