@@ -21,6 +21,7 @@ from relit.errors import UserError
 from relit.evaluate.protocols import evaluate
 from relit.fit import duplicates as recipe
 from relit.fit import duplicates_poses as poses_stage
+from relit.fit import duplicates_shape as shape
 from relit.fit import odd_instances as odd
 from relit.images import write_linear
 from relit.run import Run
@@ -159,7 +160,7 @@ def test_what_a_wrongly_placed_instance_shows_stands_out(pile, tmp_path):
     errors = []
     for some, name in ((poses, "right"), (wrong, "wrong")):
         with Run.open(tmp_path / name, {}) as run, run.stage("volume", steps=60, title="volume") as stage:
-            model, bank, _ = recipe.shape_and_poses(views, some, run, stage, options, 0)
+            model, bank, _ = shape.shape_and_poses(views, some, run, stage, options, 0)
             errors.append(odd.view_errors(bank, model))
     assert errors[0].max() < 1.3 * np.median(errors[0])
     assert errors[1][2] > 1.3 * np.delete(errors[1], 2).max()  # of four in a short fit, the others suffer too
@@ -185,7 +186,8 @@ def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
         calls.append(bank.views)
         return np.arange(bank.views) == 2
 
-    monkeypatch.setattr(recipe, "odd_instances", third)
+    monkeypatch.setattr(shape, "odd_instances", third)
+    monkeypatch.setattr(shape, "sought_again", lambda *_: None)
     capture, options = open_capture(pile), small_options(level_steps=(12,))
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(capture, run, options, 0)

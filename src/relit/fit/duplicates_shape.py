@@ -1,0 +1,179 @@
+"""The shape of identical objects: the volume pass in the object's frame with the poses of all instances, who is left out of it and who is
+found again, the mesh, and the ground that they stand on. For the recipe `duplicates`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import mitsuba as mi
+import numpy as np
+
+from relit.cameras.se3 import rotation_angle
+from relit.errors import EXIT_FAILED, UserError
+from relit.fit.duplicates_options import DuplicatesOptions
+from relit.fit.duplicates_poses import named
+from relit.fit.instance_search import Search
+from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
+from relit.fit.odd_instances import odd_instances, view_errors
+from relit.fit.outlines import follow_with_poses
+from relit.fit.pile_photos import Scene, gather
+from relit.fit.pile_scene import distance_in, find_ground, set_down
+from relit.fit.pixels import PixelBank
+from relit.fit.sought_again import sought_again
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.geometry.atlas import unwrap
+from relit.geometry.mesh import extract_mesh
+from relit.geometry.sdf import dense_values, row_features
+from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
+
+HOLD = 40  # steps of the volume pass before poses move
+
+
+def shape_stages(
+    views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int
+) -> dict[str, np.ndarray]:
+    """Volume pass, mesh, ground. others: views without poses. Returns (and keeps) vertices, faces, normals, uvs, base (V, 3), plane (point,
+    normal) or empty; for each instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view);
+    motions (P, 4, 4) first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances
+    (N,) which of the instances it is."""
+    views, poses, model = volume_stage(views, poses, others, run, options, seed)
+    rate = pose_rate(views, options)
+    with run.stage("mesh", title="mesh, atlas, ground") as stage:
+        values = dense_values(model.grid)
+        mesh = extract_mesh(values, faces=options.faces)
+        if rate > 0:
+            cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+            mesh, poses = follow_with_poses(mesh, cameras, [v.mask for v in views], [v.known for v in views], options.outlines)
+        mesh, how = unwrap(mesh, options.texture)
+        if how != "xatlas":
+            run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
+        rows = row_features(model.grid)
+        scene = related(views, poses)
+        turned = scene.motions if len(scene.motions) > 1 else [np.eye(4)]
+        seen = [
+            instance_radiance(
+                model.grid, rows, model.reflections, mesh.vertices, mesh.normals, motion_or_none(turned[v.photo]) @ np.linalg.inv(p), k
+            )
+            for k, (v, p) in enumerate(zip(views, poses, strict=True))
+        ]
+        shown = [np.flatnonzero(scene.of_view == n) for n in range(len(scene.standing))]
+        poses = np.linalg.inv(scene.standing)
+        plane = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, poses)
+        if len(plane) and rate > 0 and len(scene.motions) == 1:
+            poses, plane, count = set_down(mesh.vertices, poses, plane, distance_in(values))
+            if count:
+                run.say(f"{count} instances were moved along their lines of sight onto the ground, or onto what they rest on")
+        if len(plane) == 0:
+            run.say("note: no ground was found that the instances stand on; nothing but they themselves casts shadows")
+        parts = {
+            "vertices": mesh.vertices,
+            "faces": mesh.faces,
+            "normals": mesh.normals,
+            "uvs": mesh.uvs,
+            "base": seen[0][1],
+            "radiance": np.stack([np.mean([seen[k][0] for k in some], 0) for some in shown]),
+            "poses": poses,
+            "keys": np.array([views[some[0]].key for some in shown]),
+            "view_keys": np.array([v.key for v, n in zip(views, scene.of_view, strict=True) if n >= 0]),
+            "view_instances": scene.of_view[scene.of_view >= 0],
+            "motions": np.array([motion_or_none(m) for m in scene.motions]),
+            "related": np.array([m is not None for m in scene.motions]),
+            "plane": plane,
+        }
+        stage.save("mesh", **parts)
+    return parts
+
+
+def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):
+    """(views, poses, model) after the volume pass. Where what some instances show does not agree with the model of all, they are left out,
+    and the pass is made again without them, from the poses that it had found. They, and `others`, which the search could not place,
+    are then sought in the finished model."""
+    with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
+        left_out = stage.load("left_out")
+        if left_out is None:
+            model, bank, moved = shape_and_poses(views, poses, run, stage, options, seed)
+            odd = odd_instances(bank, model, seed) if pose_rate(views, options) > 0 else np.zeros(len(views), bool)
+            if odd.any():
+                stage.save("checkpoint", step=0)  # the second pass begins anew
+                left_out = {"odd": odd, "poses": moved}
+                stage.save("left_out", **left_out)
+        if left_out is not None:
+            odd = left_out["odd"]
+            for k in np.flatnonzero(odd):
+                run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
+            others = [*others, *(views[k] for k in np.flatnonzero(odd))]
+            views = [v for v, out in zip(views, odd, strict=True) if not out]
+            model, bank, moved = shape_and_poses(views, left_out["poses"][~odd], run, stage, options, seed)
+        if others and pose_rate(views, options) > 0 and "search" not in options.without:
+            views, moved = with_found(views, moved, others, model, bank, run, seed)
+        return views, moved, model
+
+
+def with_found(views: list[View], poses: np.ndarray, others: list[View], model: VolumeModel, bank: PixelBank, run, seed: int):
+    """The views and their poses, and those of `others` that are found in the model, which gets their entries."""
+    level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
+    turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
+    found = []
+    for view in others:
+        pose = sought_again(view, views[0], poses[0], model, level, turns, seed)
+        run.say(f"the object with {named(view)} was {'' if pose is not None else 'not '}found in the finished model of the others")
+        if pose is not None:
+            found.append((view, pose))
+    model.reflections = mi.Float(np.concatenate([np.array(model.reflections), np.zeros(4 * len(found), np.float32)]))
+    return [*views, *(v for v, _ in found)], np.concatenate([poses, *(p[None] for _, p in found)])
+
+
+def pose_rate(views: list[View], options: DuplicatesOptions) -> float:
+    """Step of the pose corrections in the volume pass."""
+    return 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
+
+
+def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: DuplicatesOptions, seed: int):
+    """One volume pass: (model, its pixel bank, poses)."""
+    bank = pixel_bank(views, poses)
+    inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
+    try:
+        values = carved(views, poses, options.levels[0], 0.15, Search.depth, crossed=True)
+    except ValueError:
+        raise UserError(
+            "the silhouettes have nothing in common",
+            "poses are wrong, or the objects differ",
+            "check the label image",
+            code=EXIT_FAILED,
+        ) from None
+    model = start_model(values, np.maximum(inside.mean(0), 1e-3), None, full=False)
+    scene = related(views, poses, run)
+    model.appearance = shade_world if len(scene.motions) == 1 else partial(shade_world, turns=light_turns(views, scene))
+    model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
+    rate = pose_rate(views, options)
+    if rate > 0:
+        move_poses(bank, model)
+    o = VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=HOLD)
+    fit_volume(bank, model, o, stage, seed, hold_distances if rate > 0 else None)
+    return model, bank, moved_poses(bank, views, poses)
+
+
+def related(views: list[View], poses: np.ndarray, run=None) -> Scene:
+    """How the photos stand to each other (see `fit.pile_photos`); says so where a run is given and there are several."""
+    scene = gather(np.linalg.inv(poses), np.array([v.photo for v in views]))
+    if run is not None and len(scene.motions) > 1:
+        for number, motion in enumerate(scene.motions[1:], 2):
+            if motion is None:
+                run.say(f"note: photo {number} could not be related to the first: it helps to find the shape, but not material and light")
+                continue
+            run.say(f"photo {number} is turned by {rotation_angle(motion[:3, :3]):.0f} degrees against the first")
+        used = [m for m in scene.motions if m is not None]
+        run.say(f"{len(scene.standing)} instances in {len(used)} photos")
+    return scene
+
+
+def motion_or_none(motion: np.ndarray | None) -> np.ndarray:
+    """The motion, or none at all where it is not known."""
+    return np.eye(4) if motion is None else motion
+
+
+def light_turns(views: list[View], scene: Scene):
+    """Rotations from each view's photo to the first one's axes, flat, for `shade_world`."""
+    turns = [motion_or_none(scene.motions[v.photo])[:3, :3] for v in views]
+    return mi.Float(np.concatenate([t.ravel() for t in turns]).astype(np.float32))

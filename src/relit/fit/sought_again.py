@@ -1,0 +1,85 @@
+"""Instances that were left out (fit/odd_instances.py), sought once more in the model of the others, which is sharp by then.
+
+The search of fit/instance_search.py compares crops with coarse models, and what is mostly hidden may agree better in a wrong place. Against
+the finished model several places of such an instance are tried at once: each is a camera of its own that descends while shape and
+paint stay, and what it shows then agrees with the model about as well as what the others show, or the instance stays out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import mitsuba as mi
+import numpy as np
+
+from relit.cameras.se3 import rotation_angle
+from relit.fit.instance_lookup import look_for
+from relit.fit.instance_search import DETAILED, PARTS, crops_of
+from relit.fit.instances import View, albedo_render, move_poses, moved_poses, pixel_bank
+from relit.fit.loop import NoStage
+from relit.fit.odd_instances import view_errors
+from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
+
+VIEWPOINTS = 2500
+TRIES = 12  # places of an instance that are tried, at least APART degrees from each other
+APART = 12.0
+ANOTHER = 25.0  # degrees from which on a place is another one
+AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
+CLEARLY = 2.0  # times as much it is at any other place
+STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
+
+
+def sought_again(view: View, guide: View, guide_pose: np.ndarray, model: VolumeModel, level: float, turns: Callable | None, seed: int = 0):
+    """The pose (4, 4) of `view` in the model, or None where what it shows agrees with the model nowhere, or in several places.
+
+    guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
+    `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo.
+    """
+    poses = candidates(view, model, float(np.linalg.norm(guide_pose[:3, 3])), seed)
+    if len(poses) == 0:
+        return None
+    poses, errors = descended(view, guide, guide_pose, poses, model, turns, seed)
+    best = int(np.nanargmin(errors))
+    elsewhere = [e for p, e in zip(poses, errors, strict=True) if rotation_angle(p[:3, :3].T @ poses[best][:3, :3]) > ANOTHER]
+    agrees = errors[best] <= AGREES * level and all(e >= CLEARLY * errors[best] for e in elsewhere)
+    return poses[best] if agrees else None
+
+
+def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:
+    """(at most TRIES, 4, 4) places that look most like the view, by rendering."""
+    crops, render = crops_of([view]), albedo_render(model)
+    found = []
+    for parts in (DETAILED, PARTS):
+        rings = crop_rings(crops, parts)
+        gallery = make_gallery(render, views_from(directions_around(VIEWPOINTS, seed), distance), parts)
+        looked = look_for([view], crops, gallery, rings, parts, keep=TRIES // 2, apart=APART)
+        for k in range(TRIES // 2):
+            if looked.scores[0, k] > -1:
+                pose, _ = refine(crops, looked.poses[:, k], render, rings=rings, steps=(0, 4.0, 2.0), parts=parts)
+                found.append(pose[0])
+    return np.array(found)
+
+
+def descended(view: View, guide: View, guide_pose: np.ndarray, poses: np.ndarray, model: VolumeModel, turns: Callable | None, seed: int):
+    """(poses (K, 4, 4), errors (K,)) after the descent of all places at once, shape and paint as they are."""
+    views = [guide] + [view] * len(poses)
+    poses = np.concatenate([guide_pose[None], poses])
+    bank = pixel_bank(views, poses)
+    shared = np.array(model.reflections)[:SHADE]
+    learnt = np.concatenate([shared, np.zeros(4 * len(views))]).astype(np.float32)
+    rates = np.concatenate([np.zeros(SHADE + 4), np.full(4 * len(views) - 4, SHADOW_RATE)]).astype(np.float32)
+    appearance = shade_world if turns is None else partial(shade_world, turns=turns(views))
+    still = replace(model, reflections=mi.Float(learnt), rates=mi.Float(rates), appearance=appearance, extra={})
+    move_poses(bank, still)
+    moves = np.array(still.extra["correction_rates"]).reshape(-1, 8)
+    moves[0] = 0
+    still.extra["correction_rates"] = mi.Float(moves.ravel())
+    sharp = model.inv_s * model.grid.h
+    frozen = {"sdf_rate": 0.0, "feature_rate": 0.0, "eikonal": 0.0, "diffusion": 0.0, "sharpness": (sharp, sharp)}
+    o = VolumeOptions((model.grid.n,), (STEPS,), RAYS, refine_cameras=RATE, **frozen)
+    fit_volume(bank, still, o, NoStage(), seed)
+    return moved_poses(bank, views, poses)[1:], view_errors(bank, still, seed)[1:]

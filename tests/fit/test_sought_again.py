@@ -1,0 +1,58 @@
+"""An instance that was left out, sought in the finished model of the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from volume_lump import photos_of, volume_lump
+
+from relit.cameras.se3 import rotation_angle
+from relit.fit import sought_again as module
+from relit.fit.instances import View, pixel_bank
+from relit.fit.odd_instances import view_errors
+from relit.fit.register import volume_render
+from relit.fit.sought_again import sought_again
+from relit.rendering.shade_world import shade_world, start_world_light
+
+
+@pytest.fixture(scope="module")
+def lump():
+    """A model under an even light, and views of it with their poses; of the second the left half is hidden."""
+    model = volume_lump()
+    model.appearance = shade_world
+    model.reflections, model.rates = start_world_light(0.3, 2)
+    views, poses = [], []
+    for number, (_, _, camera) in enumerate(photos_of(model, 2, np.random.default_rng(4))):
+        rgb, mask = (a[0] for a in volume_render(model)([camera]))
+        views.append(View(number, camera.with_pose(np.eye(4)), rgb * (1.0 - 0.4 * number), (mask > 0.5) * 1.0, np.ones_like(mask), 1.0))
+        poses.append(camera.world_from_camera)
+    shown = np.arange(mask.shape[1]) > np.median(np.nonzero(mask > 0.5)[1])
+    views[1] = replace(views[1], mask=mask * shown, known=np.broadcast_to(shown, mask.shape) * 1.0, seen=0.5)
+    return model, views, np.array(poses)
+
+
+def test_it_is_found_though_half_of_it_is_hidden_and_it_stands_in_the_shade(lump, monkeypatch):
+    model, (guide, hidden), poses = lump
+    monkeypatch.setattr(module, "VIEWPOINTS", 500)
+    monkeypatch.setattr(module, "STEPS", 120)
+    before = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
+    level = 0.1 * float(view_errors(pixel_bank([hidden], poses[:1]), model)[0])  # of a wrong place: a tenth
+    found = sought_again(hidden, guide, poses[0], model, level, None)
+    assert rotation_angle(found[:3, :3].T @ poses[1][:3, :3]) < 1.5
+    assert np.linalg.norm(found[:3, 3] - poses[1][:3, 3]) < 0.1
+    mirrored = replace(hidden, rgb=hidden.rgb[:, ::-1], mask=hidden.mask[:, ::-1], known=hidden.known[:, ::-1])
+    assert sought_again(mirrored, guide, poses[0], model, level / 8, None) is None
+    after = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))  # the model itself stays
+
+
+def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
+    model, (guide, hidden), poses = lump
+    turned = poses[[1, 1]] @ np.eye(4)
+    turned[1, :3] = np.diag([-1.0, 1.0, -1.0]) @ turned[1, :3]
+    monkeypatch.setattr(module, "candidates", lambda *_: turned)
+    for errors, out in (([1.0, 1.5], True), ([1.0, 3.0], False), ([9.0, 30.0], True)):
+        monkeypatch.setattr(module, "descended", lambda *_, e=errors: (turned, np.array(e)))
+        assert (sought_again(hidden, guide, poses[0], model, 1.0, None) is None) == out
