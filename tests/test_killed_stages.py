@@ -131,7 +131,7 @@ JOBS = [
     (room_photos, ["cameras"]),
     (unmasked_photos, ["explore"]),
     (flash_photos, ["volume", "mesh"]),
-    (pile_photo, ["poses", "volume", "surface"]),
+    (pile_photo, ["poses", "joint", "volume", "surface"]),
     (collection_with_held_out, ["links", "poses", "second_look", "held_out"]),
 ]
 

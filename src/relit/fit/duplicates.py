@@ -2,7 +2,8 @@
 
     poses     a virtual camera for each instance; matching, and search by rendering      fit/duplicates_poses.py, fit/instance_search.py
     photos    of several photos of one pile how they stand to each other                 fit/pile_photos.py
-    volume     one signed distance field in the object's frame, seen by all virtual cameras; poses move with it      fit/volume.py
+    joint     one signed distance field in the object's frame, seen by all virtual cameras, moves with the poses; odd ones out fit/volume.py
+    volume    the same once more, from those poses; who was left out is sought in it          fit/duplicates_shape.py, fit/sought_again.py
     mesh       zero level set, decimated; mesh and poses as the outlines are; texture atlas; the ground      fit/outlines.py
     surface    one material for all instances and one environment, light traced past all instances and the ground     fit/surface.py
     asset      object, instances, ground and light in the frame of the user's camera
@@ -46,7 +47,7 @@ from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh
 
 __all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
 LIGHT = "several identical objects under one light are assumed (duplicates)"  # what `relit inspect` says
-STAGES = ("poses", "volume", "mesh", "surface")
+STAGES = ("poses", "joint", "volume", "mesh", "surface")
 FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
 COST = {"draft": (60.0, 1.0e9), "standard": (300.0, 2.0e9), "high": (1200.0, 3.0e9)}

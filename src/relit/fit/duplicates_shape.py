@@ -26,6 +26,7 @@ from relit.geometry.atlas import unwrap
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
+from relit.run import run_arrays
 
 HOLD = 40  # steps of the volume pass before poses move
 
@@ -85,29 +86,33 @@ def shape_stages(
     return parts
 
 
+def joint_stage(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
+    """(poses, odd (N,) bool) after a first volume pass. What it gives is thrown away but for the poses, and which instances show what does
+    not agree with the model of all: a shape that grew up with better poses is sharper, and moves them on."""
+    if run.done("joint"):
+        saved = run_arrays(run, "joint", "joint")
+        return saved["poses"], saved["odd"]
+    with run.stage("joint", steps=sum(options.level_steps), title="shape and poses (first pass)") as stage:
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed)
+        odd = odd_instances(bank, model, seed)
+        for k in np.flatnonzero(odd):
+            run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
+        stage.save("joint", poses=poses, odd=odd)
+    return poses, odd
+
+
 def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):
-    """(views, poses, model) after the volume pass. Where what some instances show does not agree with the model of all, they are left out,
-    and the pass is made again without them, from the poses that it had found. They, and `others`, which the search could not place,
-    are then sought in the finished model."""
+    """(views, poses, model) after the volume pass, from the poses of a first one. Instances that do not agree with that one's model are
+    left out; they, and `others`, which the search could not place, are then sought in the finished model."""
+    if pose_rate(views, options) > 0:
+        poses, odd = joint_stage(views, poses, run, options, seed)
+        others = [*others, *(views[k] for k in np.flatnonzero(odd))]
+        views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
-        left_out = stage.load("left_out")
-        if left_out is None:
-            model, bank, moved = shape_and_poses(views, poses, run, stage, options, seed)
-            odd = odd_instances(bank, model, seed) if pose_rate(views, options) > 0 else np.zeros(len(views), bool)
-            if odd.any():
-                stage.save("checkpoint", step=0)  # the second pass begins anew
-                left_out = {"odd": odd, "poses": moved}
-                stage.save("left_out", **left_out)
-        if left_out is not None:
-            odd = left_out["odd"]
-            for k in np.flatnonzero(odd):
-                run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
-            others = [*others, *(views[k] for k in np.flatnonzero(odd))]
-            views = [v for v, out in zip(views, odd, strict=True) if not out]
-            model, bank, moved = shape_and_poses(views, left_out["poses"][~odd], run, stage, options, seed)
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
-            views, moved = with_found(views, moved, others, model, bank, run, seed)
-        return views, moved, model
+            views, poses = with_found(views, poses, others, model, bank, run, seed)
+        return views, poses, model
 
 
 def with_found(views: list[View], poses: np.ndarray, others: list[View], model: VolumeModel, bank: PixelBank, run, seed: int):

@@ -1,4 +1,4 @@
-"""Instances that stand out after the volume pass: what they show does not agree with the model of all.
+"""Instances that stand out after the first volume pass: what they show does not agree with the model of all.
 
 An instance that is mostly hidden can be placed wrongly and still agree with the coarse models of the search. The volume pass then paints
 what it shows onto the object, and its silhouette bends the shape. Against the finished model its pixels are wrong by several times what
