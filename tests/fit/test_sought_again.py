@@ -38,19 +38,19 @@ def test_it_is_found_though_half_of_it_is_hidden_and_it_stands_in_the_shade(lump
     monkeypatch.setattr(module, "VIEWPOINTS", 500)
     monkeypatch.setattr(module, "STEPS", 120)
     before = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
-    level = 0.1 * float(view_errors(pixel_bank([hidden], poses[:1]), model)[0])  # of a wrong place: a tenth
+    level = float(view_errors(pixel_bank([hidden], poses[:1]), model)[0]) / 80  # a tenth of what it is at a wrong place agrees
     found = sought_again(hidden, guide, poses[0], model, level, None)
     assert rotation_angle(found[:3, :3].T @ poses[1][:3, :3]) < 1.5
     assert np.linalg.norm(found[:3, 3] - poses[1][:3, 3]) < 0.1
     mirrored = replace(hidden, rgb=hidden.rgb[:, ::-1], mask=hidden.mask[:, ::-1], known=hidden.known[:, ::-1])
-    assert sought_again(mirrored, guide, poses[0], model, level / 8, None) is None
+    assert sought_again(mirrored, guide, poses[0], model, level, None) is None
     after = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))  # the model itself stays
 
 
 def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
     model, (guide, hidden), poses = lump
-    turned = poses[[1, 1]] @ np.eye(4)
+    turned = poses[[1, 1]]
     turned[1, :3] = np.diag([-1.0, 1.0, -1.0]) @ turned[1, :3]
     monkeypatch.setattr(module, "candidates", lambda *_: turned)
     for errors, out in (([1.0, 1.5], True), ([1.0, 3.0], False), ([9.0, 30.0], True)):

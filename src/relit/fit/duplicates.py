@@ -63,11 +63,9 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     if "normals" in options.without and not options.normal_network and all(pixels.normal is None for pixels, _ in shots):
         run.say("note: without=normals changes nothing: no photo has normal priors")
     poses, registered, keys, unsure = poses_stage(shots, run, options, seed)
-    chosen = [k for k in range(len(keys)) if registered[k]]
-    views, others = [], []
-    for view in all_views(shots, options.side, options):
-        (views if view.key in {keys[k] for k in chosen} else others if view.key in keys else []).append(view)
-    poses = poses[chosen]
+    shown = [v for v in all_views(shots, options.side, options) if v.key in keys]
+    views, others = ([v for v in shown if (v.key in keys[registered]) == placed] for placed in (True, False))
+    poses = poses[registered]
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
     else:

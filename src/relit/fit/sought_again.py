@@ -25,7 +25,7 @@ from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
 
 VIEWPOINTS = 2500
-TRIES = 12  # places of an instance that are tried, at least APART degrees from each other
+TRIES = 12  # places of an instance that are tried, half of them under each descriptor and these at least APART degrees from each other
 APART = 12.0
 ANOTHER = 25.0  # degrees from which on a place is another one
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
