@@ -8,7 +8,7 @@ from test_flash_dino import write_network
 
 from relit.fit.flash_dino import DinoNetwork
 from relit.fit.flash_features import FlashView, capture_features, network_features, seen_from
-from relit.fit.kinship import LADDER, best_lobes, highlights_seen, pooled, start_kinship
+from relit.fit.kinship import LADDER, SCALES, best_lobes, highlights_seen, pooled, start_kinship
 from relit.materials.plastic_field import plastic_at
 from relit.materials.rough_plastic import Coat
 
@@ -77,7 +77,7 @@ def test_like_groups_count_each_other_s_evidence():
     kin = start_kinship(features, np.ones((1, 300), bool), np.full((1, 300, 2), 0.3), groups=4)
     centres = np.array(kin.index).reshape(300, 4)[:, 0]
     first, last = centres[0], centres[-1]
-    assert kin.alike[first, centres[150]] > 0.5 and kin.alike[first, last] < 1e-6
+    assert kin.apart[first, centres[150]] < min(SCALES[:3]) ** 2 and kin.apart[first, last] > (3 * max(SCALES)) ** 2
     np.testing.assert_allclose(np.array(kin.weight).reshape(300, 4).sum(1), 1, rtol=1e-5)
 
 

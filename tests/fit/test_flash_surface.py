@@ -6,12 +6,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, calm_weights, fit_flash_surface, offset_of
+from relit.fit.flash_surface import (
+    FlashModel,
+    FlashSurfaceOptions,
+    brightness,
+    calm_weights,
+    fit_flash_surface,
+    offset_of,
+    paired_loss,
+    rescale,
+    robust_weight,
+)
 from relit.fit.kinship import best_lobes, start_kinship
 from relit.fit.loop import NoStage
 from relit.fit.pixels import batch_of
 from relit.lighting.flash import light_position
-from relit.materials.plastic_field import plastic_at, plastic_pictures, start_plastic
+from relit.materials.plastic_field import PlasticField, plastic_at, plastic_pictures, start_plastic
 from relit.materials.rough_plastic import Coat
 from relit.rendering.transport import bent_normal, first_hits
 from relit.rendering.transport_flash import direct, indirect, lit
@@ -152,6 +162,51 @@ def test_even_pixels_count_more_than_edges(shot):
     assert weights[masks == 0].max() <= 1 and weights[0, 0, 0] == 1
     rim = (masks[0] > 0.5) & (np.roll(masks[0], 1, 1) < 0.5)
     assert weights[0][rim].mean() < 0.3
+
+
+def test_common_scale_is_restored_and_direct_light_stays(shot):
+    bank, _, mesh, field = shot
+    brightest = brightness(field)
+    batch = batch_of(bank, dr.arange(mi.UInt32, 0, bank.total, 11))
+    points = first_hits(mesh, batch.o, batch.d)
+    dr.eval(points, batch.view)
+
+    def picture(model):
+        plastic, _ = plastic_at(model.field, points.uv, points.valid)
+        intensity = dr.exp(dr.gather(mi.Float, model.log_intensity, mi.UInt32(0)))
+        return np.array(direct(points, plastic, Coat(), points.n, mi.Vector3f(0, 0, 3), intensity, mi.Float(1)))
+
+    factors = mi.Float(np.tile([0.8, 1.0], field.size**2).astype(np.float32))
+    darker = PlasticField(field.size, field.diffuse * 0.8, field.lobe * factors, field.slope)
+    model = FlashModel(darker, None, None, mi.Vector3f(0), mi.Float([1.0]), Coat())
+    before = picture(model)
+    rescale(model, brightest)
+    assert brightness(model.field) == pytest.approx(brightest, rel=1e-5)
+    assert float(model.log_intensity[0]) == pytest.approx(1 + np.log(0.8), abs=1e-5)
+    np.testing.assert_allclose(picture(model), before, rtol=1e-4, atol=1e-6)
+
+
+def test_noise_of_inter_reflection_does_not_move_the_base(device):
+    """Few directions carry most of the light that comes back. With the weight of residuals that have that noise, bright estimates hardly
+    count and the base would be told to be brighter."""
+    count = 400_000
+    rng = np.random.default_rng(1)
+    back = [mi.Color3f(mi.Float(rng.lognormal(-4.0, 1.5, count).astype(np.float32))) for _ in range(2)]
+    expected_back = float(np.exp(-4.0 + 1.5**2 / 2))
+    target, sigma = mi.Color3f(0.3 + expected_back), mi.Float(0.1)
+
+    def pull(weight_of):
+        base = mi.Float(0.3)
+        dr.enable_grad(base)
+        a, b = (mi.Color3f(base) + other for other in back)
+        trust = robust_weight(weight_of(dr.detach(a), dr.detach(b)) - target, target, sigma)
+        dr.backward(paired_loss(a, b, target, mi.Mask(True), trust, mi.Float(1e9)))
+        return float(dr.grad(base)[0])
+
+    known = pull(lambda a, b: mi.Color3f(0.3 + 0.8 * expected_back))  # rough, and without noise
+    noisy = pull(lambda a, b: (a + b) * 0.5)
+    assert noisy < 0  # a descent would brighten the base
+    assert abs(known) < 0.1 * abs(noisy)
 
 
 def test_a_group_without_evidence_stays():

@@ -51,8 +51,8 @@ from relit.settings import check_parts, preset
 
 LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
-# 120 photos of 400x400 took 150 s and 1.6 GB at standard, half of it the volume pass, half the surface pass; a fifth at draft
-COST = {"draft": (30.0, 0.9e9), "standard": (147.0, 1.2e9), "high": (450.0, 2.5e9)}
+# 120 photos of 400x400 took 250 s and 2.4 GB at standard, half of it the volume pass, half the surface pass; a fifth at draft
+COST = {"draft": (35.0, 0.9e9), "standard": (240.0, 2.0e9), "high": (600.0, 2.8e9)}
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
 COARSE_FACES = 20_000  # of the mesh on which the volume pass's inter-reflection is estimated
 PLACE = 0.15  # how much a unit length counts beside a display value when places are compared
@@ -74,8 +74,8 @@ class FlashOptions:
     switched off, names of WITHOUT.
     """
 
-    levels: tuple[int, ...] = (96, 192)
-    level_steps: tuple[int, ...] = (400, 500)
+    levels: tuple[int, ...] = (128, 256)
+    level_steps: tuple[int, ...] = (400, 600)
     rays: int = 8192
     max_pixels: int = 24_000_000
     shadows: bool = True
@@ -117,7 +117,7 @@ PRESETS = {
         "bounces": 1,
     },
     "standard": {},
-    "high": {"levels": (128, 256), "level_steps": (800, 1000), "max_pixels": 60_000_000, "texture": 1024, "surface_steps": 5000},
+    "high": {"level_steps": (800, 1200), "max_pixels": 60_000_000, "texture": 1024, "surface_steps": 5000},
 }
 
 
@@ -325,6 +325,8 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, run, 
             lobe = np.stack([specular, alpha], -1)
             kinship = start_kinship(np.concatenate([features, place], -1), known, lobe)
         model = FlashModel(field, mi.Float(features.ravel()), kinship, mi.Float(parts["offset"]), log_intensity, coat)
+        if ambient is not None:
+            model.around = ambient.on_texels(texels["x"], texels["n"], known, coat)
         fit_flash_surface(bank, cameras, traceable, model, o, stage, seed)
         maps = {name: fill_gutters(picture, known) for name, picture in plastic_pictures(model.field).items()}
         maps |= {"offset": np.array(model.offset), "intensity": np.exp(np.array(model.log_intensity))}

@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
@@ -22,7 +23,7 @@ from relit.fit.flash_features import ALPHA, FlashView, capture_features, seen_fr
 from relit.fit.pixels import PixelBank
 from relit.geometry.sdf import node_positions
 from relit.materials.rough_plastic import Coat
-from relit.rendering.shade_flash import Around
+from relit.rendering.shade_flash import Around, AroundTexels
 from relit.rendering.transport import OFFSET, TraceableMesh, first_hits
 from relit.scene import Camera, Mesh
 
@@ -44,6 +45,14 @@ class Ambient:
         distance, index = self.tree.query(np.concatenate([x, TURN * n], 1), count)
         weight = 1 / (np.square(distance.reshape(len(x), -1)) + 1e-6)
         return index.reshape(len(x), -1), weight / weight.sum(1, keepdims=True)
+
+    def on_texels(self, x: np.ndarray, n: np.ndarray, known: np.ndarray, coat: Coat) -> AroundTexels:
+        """For the surface pass. x, n: (N, 3) unit frame, points and normals of the known texels. known: (S, S) bool."""
+        place = np.zeros(known.shape, np.int64)
+        place[known] = self.near(x, n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9), 1)[0][:, 0]
+        place = place[tuple(distance_transform_edt(~known, return_distances=False, return_indices=True))].astype(np.uint32)
+        enters = coat.mean_transmittance(ALPHA)
+        return AroundTexels(mi.Float(self.light.ravel()), mi.UInt32(place.ravel()), known.shape[0], self.light.shape[1], enters)
 
     def around(self, values: np.ndarray, coat: Coat) -> Around:
         """For the volume pass. values: (n, n, n) signed distances, unit frame."""

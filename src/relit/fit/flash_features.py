@@ -19,7 +19,7 @@ from relit.conventions import srgb_from_linear
 from relit.fit.flash_dino import DinoNetwork, dino_features
 from relit.fit.pixels import PixelBank
 from relit.lighting.flash import incident, light_position
-from relit.materials.rough_plastic import Coat
+from relit.materials.rough_plastic import Coat, base_radiance
 from relit.rendering.transport import OFFSET, TraceableMesh
 from relit.scene import Camera
 
@@ -131,7 +131,7 @@ def shading_free(bank: PixelBank, camera: Camera, view: int, mesh: TraceableMesh
     enters = mi.Color3f(coat.transmittance(cos_l, alpha) * cos_l * seen.inverse)
     if np.ndim(around):
         enters += mi.Color3f(np.ascontiguousarray(around.T, np.float32)) * coat.mean_transmittance(ALPHA)
-    base = coat.transmittance(cos_v, alpha) / (1 - coat.internal(alpha)) * (dr.inv_pi / coat.ior**2) * enters
+    base = base_radiance(mi.Color3f(1), coat, cos_v, alpha, enters)
     out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * flash.intensity, 1e-6)
     out = dr.select(ok, out, dr.nan)
     return np.array(out).T, np.array(cos_v)

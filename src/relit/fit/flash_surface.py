@@ -25,9 +25,12 @@ from relit.fit.preview import surface_preview
 from relit.fit.surface import drawn_points, dual_values, neighbours
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import PlasticField, plastic_at, project
-from relit.materials.rough_plastic import Coat, Plastic
+from relit.materials.rough_plastic import Coat, Plastic, base_radiance
 from relit.rendering.transport import Points, TraceableMesh, bent_normal
 from relit.rendering.transport_flash import direct, indirect, lit
+
+RESCALE = 25  # steps after which albedos and intensity are brought back to their common scale
+BOUNCE_SAMPLES = 8  # of inter-reflection per pixel where the groups' evidence is gathered
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ class FlashSurfaceOptions:
 @dataclass
 class FlashModel:
     """field: the textures. features: Float [size^2 * 4], what places are compared by. kinship: which places are alike, or None.
-    offset: Float [3], unit frame. log_intensity: Float [1]. coat: the tables."""
+    offset: Float [3], unit frame. log_intensity: Float [1]. coat: the tables. around: light that the surface throws on itself, as it was
+    known before the pass (fit/flash_ambient.py), or None."""
 
     field: PlasticField
     features: Any
@@ -85,6 +89,7 @@ class FlashModel:
     offset: Any
     log_intensity: Any
     coat: Coat
+    around: Any = None
 
 
 def fit_flash_surface(
@@ -94,6 +99,7 @@ def fit_flash_surface(
     field, o = model.field, options
     even = calm_weights(bank, cameras, o.edge)
     beginning = PlasticField(field.size, mi.Float(field.diffuse), field.lobe, field.slope)
+    brightest = brightness(beginning)
     first = 0
     saved = stage.load("checkpoint")
     if saved:
@@ -129,12 +135,14 @@ def fit_flash_surface(
         n = bent_normal(points, slope)
         straight = direct(points, plastic, model.coat, n, position, intensity, seen)
         a = b = straight
+        expected = straight + expected_bounce(model, points, plastic, n, batch.view, intensity)
         if o.directions > 0:
             a, b = (straight + bounced(mesh, field, model, points, plastic, n, position, intensity, rng, o) for _ in range(2))
         e = min(1.5 * i / o.steps, 1.0)
         sigma = dr.opaque(mi.Float, o.robust[0] ** (1 - e) * o.robust[1] ** e)
         saturated = saturated_at(bank, batch.view)
-        fit = robust_loss(a, b, batch.rgb, valid, calm, sigma, saturated)
+        trust = calm * robust_weight(dr.detach(expected) - batch.rgb, batch.rgb, sigma)
+        fit = paired_loss(a, b, batch.rgb, valid, trust, saturated)
         if o.patches > 0:
             counts = valid & well_exposed(batch.rgb, saturated)
             alike = pyramid_loss(a, b, batch.rgb, dr.select(counts, calm, 0)) + ssim_loss(a, b, batch.rgb, counts)
@@ -161,17 +169,23 @@ def fit_flash_surface(
                 keep = 1 - (1 - model.kinship.own(o.own)) * dr.opaque(mi.Float, decay)
                 field.lobe = common + keep * (field.lobe - common)
                 if i % (o.share_every if 20 * i > o.steps else 2) == 0:
-                    share(points, batch, plastic, n, position, intensity, seen, (a + b) * 0.5 - straight, calm, sigma, decay)
+                    share(points, batch, plastic, n, position, intensity, seen, calm, sigma, decay)
+        if i % RESCALE == RESCALE - 1:
+            rescale(model, brightest)
         project(field)
         dr.eval(model.offset, model.log_intensity, field.diffuse, field.lobe, field.slope)
         return {"colour": fit}
 
-    def share(points, batch, plastic, n, position, intensity, seen, bounce, calm, sigma, decay):
-        n, position, intensity, bounce, plastic = (dr.detach(v) for v in (n, position, intensity, bounce, plastic))
-        photo = batch.rgb - bounce
+    def share(points, batch, plastic, n, position, intensity, seen, calm, sigma, decay):
+        n, position, intensity, plastic = (dr.detach(v) for v in (n, position, intensity, plastic))
+        photo = mi.Color3f(batch.rgb)
+        for _ in range(BOUNCE_SAMPLES if o.directions > 0 else 0):
+            photo -= bounced(mesh, field, model, points, plastic, n, position, intensity, rng, o) / BOUNCE_SAMPLES
+            dr.eval(photo, rng)
         now = direct(points, plastic, model.coat, n, position, intensity, seen)
+        now += expected_bounce(model, points, plastic, n, batch.view, intensity)
         counts = points.valid & well_exposed(batch.rgb, saturated_at(bank, batch.view))
-        weight = display_weight(batch.rgb) * dr.select(counts, calm * robust_weight(now - photo, batch.rgb, sigma), 0)
+        weight = display_weight(batch.rgb) * dr.select(counts, calm * robust_weight(now - batch.rgb, batch.rgb, sigma), 0)
         dr.eval(n, position, intensity, photo, weight, plastic)
         shade = lambda p: direct(points, p, model.coat, n, position, intensity, seen)  # noqa: E731
         told, _ = plastic_at(beginning, points.uv, points.valid)
@@ -190,6 +204,23 @@ def fit_flash_surface(
 
     run_steps(stage, first, o.steps, step, state, preview=surface_preview(bank, mesh, textures))
     return model
+
+
+def brightness(field: PlasticField) -> float:
+    """The 99th percentile over texels of the brightest channel of the diffuse albedo."""
+    return float(np.percentile(np.array(field.diffuse).reshape(-1, 4)[:, :3].max(1), 99))
+
+
+def rescale(model: FlashModel, brightest: float) -> None:
+    """Albedos and intensity changed by a factor and its inverse, which direct light does not notice, so that the diffuse albedo is as
+    bright as it was. What inter-reflection there is rests on that factor; it must not drift with chance along a valley so flat."""
+    factor = dr.opaque(mi.Float, brightness(model.field) / max(brightest, 1e-6))
+    specular = lambda lobe: dr.select(dr.arange(mi.UInt32, dr.width(lobe)) % 2 == 0, lobe / factor, lobe)  # noqa: E731
+    model.field.diffuse = model.field.diffuse / factor
+    model.field.lobe = specular(model.field.lobe)
+    model.log_intensity = model.log_intensity + dr.log(factor)
+    if model.kinship is not None:
+        model.kinship.level = specular(model.kinship.level)
 
 
 def offset_of(flat):
@@ -219,13 +250,20 @@ def calm_weights(bank: PixelBank, cameras, edge: float):
     return mi.Float(np.concatenate(weights))
 
 
-def robust_loss(a, b, target, valid, calm, sigma, saturated):
-    """Mean of w (a - L*)(b - L*) with w of the photo, less where both estimates are far off (Geman & McClure's weight, detached).
+def expected_bounce(model: FlashModel, points: Points, plastic, n, view, intensity):
+    """Color3f, detached: the inter-reflected light as it was known before the pass. It is rough, but without noise: a weight that saw the
+    noise of an estimate would take sides, for the dark ones."""
+    if model.around is None:
+        return mi.Color3f(0)
+    with dr.suspend_grad():
+        at, cos_v = dr.detach(plastic), dr.abs(dr.dot(dr.detach(n), points.v))
+        entered = model.around.at(view, points.uv) * (dr.detach(intensity) * model.around.enters)
+        return base_radiance(at.diffuse, model.coat, cos_v, at.alpha, entered)
 
-    sigma: opaque Float, display value where it is a quarter. A saturated pixel says only "at least this bright".
-    """
-    mean = dr.detach((a + b) * 0.5)
-    value = dual_values(a, b, target, saturated) * calm * robust_weight(mean - target, target, sigma)
+
+def paired_loss(a, b, target, valid, trust, saturated):
+    """Mean of w (a - L*)(b - L*) with w of the photo, times trust (Float). A saturated pixel says only "at least this bright"."""
+    value = dual_values(a, b, target, saturated) * trust
     return dr.sum(dr.select(valid, value, 0)) / dr.maximum(dr.sum(dr.select(valid, mi.Float(1), 0)), 1)
 
 

@@ -33,7 +33,8 @@ COLUMNS = 4  # lobe of a specular albedo of 1, diffuse light as it is, diffuse l
 FORGET = 0.8  # of the running sums per call
 SEEN = (0.008, 0.02)  # strength of a narrow lobe over a white base, root mean square, where a group's evidence begins and is whole
 NARROW = 6  # rung of the ladder, alpha .11, that this is asked of
-FAR = 1e-3  # weight of the evidence of groups that are less alike
+SCALES = (0.16, 0.08, 0.04, 0.02, 0.01)  # distances of features over which evidence is shared, from broad to narrow
+LENT = (0.02, 1.0, 8.0, 8.0)  # information about the lobe that each but the narrowest lends to the next at most
 UNSEEN_OWN = 0.8  # part of what a texel has to itself that is kept per step where no highlight is seen
 LEAST = 1e-4  # evidence below this part of the mean group's tells nothing
 PRIOR = (1e-4, 1e-5, 1e-5)  # belief in no change of specular albedo, factor and shift, against the evidence of the mean group
@@ -42,7 +43,7 @@ PRIOR = (1e-4, 1e-5, 1e-5)  # belief in no change of specular albedo, factor and
 @dataclass
 class Kinship:
     """groups: their number. index: UInt32 [texels * NEAREST]. weight: Float [texels * NEAREST], summing to 1 for each texel. level: Float
-    [groups * 2], specular albedo and alpha of each group. alike: (groups, groups), how far one's evidence counts for another.
+    [groups * 2], specular albedo and alpha of each group. apart: (groups, groups), squared distances of their features.
     trust: (groups,), how far a group's own evidence counts, 0 to 1.
     sums: (LADDER, groups, COLUMNS, COLUMNS), running weighted sums of products of `share_evidence`'s columns."""
 
@@ -50,7 +51,7 @@ class Kinship:
     index: Any
     weight: Any
     level: Any
-    alike: np.ndarray
+    apart: np.ndarray
     sums: np.ndarray
     trust: np.ndarray
 
@@ -77,7 +78,7 @@ class Kinship:
             self.trust = highlights_seen(sums)
 
 
-def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, groups: int = 40, width: float = 0.08) -> Kinship:
+def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, groups: int = 160, width: float = 0.08) -> Kinship:
     """Groups by k-means. features: (S, S, C), distances of about `width` are alike. known: (S, S) bool. lobe: (S, S, 2) start of
     specular albedo and alpha."""
     from scipy.cluster.vq import kmeans2
@@ -99,7 +100,7 @@ def start_kinship(features: np.ndarray, known: np.ndarray, lobe: np.ndarray, gro
         mi.UInt32(index.astype(np.uint32).ravel()),
         numbers(weight),
         numbers(level),
-        np.exp(-apart / (2 * (width / 2) ** 2)) + FAR * np.exp(-apart / (2 * (2 * width) ** 2)),
+        apart,
         np.zeros((len(LADDER), groups, COLUMNS, COLUMNS)),
         np.ones(groups),
     )
@@ -148,11 +149,30 @@ def highlights_seen(sums: np.ndarray) -> np.ndarray:
 
 
 def pooled(kin: Kinship) -> np.ndarray:
-    """(LADDER, groups, COLUMNS, COLUMNS): what each group's lobe is judged by, the trusted evidence of all groups as far as they are alike.
-    The likest counts whole."""
-    weight = kin.alike * kin.trust
-    weight /= np.maximum(weight.max(1, keepdims=True), 1e-9)
-    return np.einsum("gh,lhij->lgij", weight, kin.sums)
+    """(LADDER, groups, COLUMNS, COLUMNS): what each group's lobe is judged by, the trusted evidence of groups of like features, from the
+    broadest scale to the narrowest. What a scale tells is lent to the next as far as LENT: a group that knows enough by itself, or
+    from its very likest, does not ask others; one that no photo shows near the mirror direction takes what the likest know."""
+    weight = [np.exp(-kin.apart / (2 * scale**2)) * kin.trust for scale in SCALES]
+    weight[0] /= np.maximum(weight[0].max(1, keepdims=True), 1e-9)
+    total = np.einsum("gh,lhij->lgij", weight[0], kin.sums)
+    amount = evidence_in(total)
+    for narrower, most in zip(weight[1:], LENT, strict=True):
+        lent = np.minimum(1, most / np.maximum(information(total), 1e-12))
+        total = np.einsum("gh,lhij->lgij", narrower, kin.sums) + lent[:, None, None] * total
+    return total * np.maximum(amount / np.maximum(evidence_in(total), 1e-12), 1)[:, None, None]  # lent or own, as much to believe
+
+
+def evidence_in(sums: np.ndarray) -> np.ndarray:
+    """(groups,): how much there is."""
+    return np.einsum("lgii->g", sums[..., :3, :3])
+
+
+def information(sums: np.ndarray) -> np.ndarray:
+    """(groups,): of the evidence about the specular albedo, the diffuse albedo being free (Schur complement), for a narrow lobe."""
+    lobe, base = sums[NARROW, :, 0, 0], sums[NARROW, :, 1:3, 1:3]
+    mixed = sums[NARROW, :, 0, 1:3]
+    ridge = (1e-6 * np.trace(base, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(2)
+    return lobe - np.einsum("gi,gi->g", mixed, np.linalg.solve(base + ridge, mixed[..., None])[..., 0])
 
 
 def best_lobes(sums: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -174,7 +194,7 @@ def best_lobes(sums: np.ndarray, level: np.ndarray) -> np.ndarray:
     t = np.clip(0.5 * (a - c) / np.maximum(a - 2 * b + c, 1e-12), -1, 1)[:, None]  # the parabola through three rungs of log alpha
     blend = np.where(t < 0, (1 + t) * found[k, g] - t * found[k - 1, g], (1 - t) * found[k, g] + t * found[k + 1, g])
     alpha = LADDER[k] * (LADDER[1] / LADDER[0]) ** t[:, 0]
-    evidence = np.einsum("lgii->g", sums[..., :3, :3])
+    evidence = evidence_in(sums)
     known = evidence > LEAST * evidence.mean()
     out = np.stack([np.clip(blend[:, 0], 0, 2), alpha, np.clip(blend[:, 1], 0.7, 1.4), np.clip(blend[:, 2], -0.1, 0.1)], 1)
     return np.where(known[:, None], out, np.stack([*level.T, prior[:, 1], prior[:, 2]], 1))

@@ -143,6 +143,12 @@ def smith_g1(cos, alpha):
     return 2 / (1 + dr.sqrt(1 + dr.square(alpha) * tan2))
 
 
+def base_radiance(diffuse, coat: Coat, cos_v, alpha, entered):
+    """Radiance of the diffuse base through the coat, Color3f. entered: Color3f, irradiance that came through the coat. cos_v: Float, of the
+    viewer's direction."""
+    return diffuse * entered * (coat.transmittance(cos_v, alpha) / (1 - coat.internal(alpha)) * (dr.inv_pi / coat.ior**2))
+
+
 def evaluate(m: Plastic, coat: Coat, n, v, l):
     """BRDF times the light's cosine, f(v, l) max(n.l, 0): Color3f. Differentiable in m, n, v, l."""
     n_dot_l, n_dot_v = dr.dot(n, l), dr.maximum(dr.dot(n, v), MIN_COS)

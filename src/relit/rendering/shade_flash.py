@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.lighting.flash import incident, light_position
-from relit.materials.rough_plastic import MIN_ALPHA, Coat, Plastic, evaluate
+from relit.materials.rough_plastic import MIN_ALPHA, Coat, Plastic, base_radiance, evaluate
 from relit.rendering.march import Marched, march, sphere_interval
 
 NODES = 24  # of the alpha grid, a side
@@ -46,6 +46,23 @@ class Around:
         return dr.gather(mi.Color3f, self.light, view * self.places + place)
 
 
+@dataclass(frozen=True)
+class AroundTexels:
+    """The same on a texture. place: UInt32 [size^2], which place a texel takes its light from. size: texels a side."""
+
+    light: Any
+    place: Any
+    size: int
+    places: int
+    enters: float
+
+    def at(self, view, uv):
+        """Color3f at texture coordinates."""
+        s = self.size
+        texel = mi.UInt32(dr.clip(uv.y * s, 0, s - 1)) * s + mi.UInt32(dr.clip(uv.x * s, 0, s - 1))
+        return dr.gather(mi.Color3f, self.light, view * self.places + dr.gather(mi.UInt32, self.place, texel))
+
+
 class FlashAppearance:
     """The function itself, with what it needs: see `fit.volume.VolumeModel.appearance`. intensity: radiant, grey, unit frame.
 
@@ -69,9 +86,8 @@ class FlashAppearance:
         if self.model.grid.n >= self.shadows_from:
             value *= self.visibility(dr.detach(x), dr.detach(n), position, m)
         if self.around is not None:
-            leaves = self.coat.transmittance(dr.abs(dr.dot(n, rays.d)), alpha) / (1 - self.coat.internal(alpha))
-            arriving = self.around.at(rays.view, dr.detach(x)) * (self.intensity * self.around.enters * dr.inv_pi / self.coat.ior**2)
-            value += diffuse * arriving * leaves
+            entered = self.around.at(rays.view, dr.detach(x)) * (self.intensity * self.around.enters)
+            value += base_radiance(diffuse, self.coat, dr.abs(dr.dot(n, rays.d)), alpha, entered)
         return value, n
 
     def visibility(self, x, n, position, m: Marched):
