@@ -194,13 +194,13 @@ def test_estimate_at_the_measured_capture_is_what_was_measured(capture):
 
 
 def test_a_flash_capture_has_a_cost_of_its_own(capture):
-    """120 photos of 400x400 at standard took 218 s and 2.4 GB; a draft about a seventh of that time."""
+    """120 photos of 400x400 at standard took 217 s and 2.4 GB; a draft 56 s (the cup)."""
     opened = open_input(capture, Job())
     many = replace(opened, photos=tuple(replace(opened.photos[0], width=400, height=400) for _ in range(120)))
     cost = estimate(many, Job(), "flash")
-    assert (cost.seconds, cost.memory) == pytest.approx((218.0, 2.4e9), rel=0.05)
+    assert (cost.seconds, cost.memory) == pytest.approx((217.0, 2.4e9), rel=0.05)
     draft, high = (estimate(many, Job(quality=q), "flash") for q in ("draft", "high"))
-    assert draft.seconds == pytest.approx(30, rel=0.2) and draft.memory < cost.memory < high.memory and cost.seconds < high.seconds
+    assert draft.seconds == pytest.approx(56, rel=0.2) and draft.memory < cost.memory < high.memory and cost.seconds < high.seconds
 
 
 def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, monkeypatch):

@@ -51,8 +51,8 @@ from relit.settings import check_parts, preset
 
 LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
-# 120 photos of 400x400 took 218 s and 2.4 GB at standard, half of it the volume pass, half the surface pass; a seventh at draft
-COST = {"draft": (30.0, 0.9e9), "standard": (215.0, 2.0e9), "high": (600.0, 2.8e9)}
+# 120 photos of 400x400 took 217 s and 2.4 GB at standard, half of it the volume pass, half the surface pass; 56 s at draft
+COST = {"draft": (55.0, 0.9e9), "standard": (215.0, 2.0e9), "high": (600.0, 2.8e9)}
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
 COARSE_FACES = 20_000  # of the mesh on which the volume pass's inter-reflection is estimated
 PLACE = 0.15  # how much a unit length counts beside a display value when places are compared

@@ -15,12 +15,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from relit.fit.flash_features import ALPHA, FlashView, capture_features, seen_from
 from relit.fit.pixels import PixelBank
+from relit.geometry.bake import fill_gutters
 from relit.geometry.sdf import node_positions
 from relit.materials.rough_plastic import Coat
 from relit.rendering.shade_flash import Around, AroundTexels
@@ -50,9 +50,8 @@ class Ambient:
         """For the surface pass. x, n: (N, 3) unit frame, points and normals of the known texels. known: (S, S) bool."""
         place = np.zeros(known.shape, np.int64)
         place[known] = self.near(x, n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9), 1)[0][:, 0]
-        place = place[tuple(distance_transform_edt(~known, return_distances=False, return_indices=True))].astype(np.uint32)
-        enters = coat.mean_transmittance(ALPHA)
-        return AroundTexels(mi.Float(self.light.ravel()), mi.UInt32(place.ravel()), known.shape[0], self.light.shape[1], enters)
+        place = mi.UInt32(fill_gutters(place, known).astype(np.uint32).ravel())
+        return AroundTexels(mi.Float(self.light.ravel()), place, known.shape[0], self.light.shape[1], coat.mean_transmittance(ALPHA))
 
     def around(self, values: np.ndarray, coat: Coat) -> Around:
         """For the volume pass. values: (n, n, n) signed distances, unit frame."""

@@ -24,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.materials.field import nearest_texel
 from relit.materials.plastic_field import PlasticField
 from relit.materials.rough_plastic import Plastic
 
@@ -112,9 +113,7 @@ def share_evidence(kin: Kinship, field: PlasticField, uv, plastic: Plastic, shad
     plastic: at the points, its diffuse albedo as the capture tells it. shade: Plastic -> radiance (Color3f) at the points, linear in the
     albedos. photo: Color3f, what direct light should show. weight: Color3f of squared differences.
     """
-    s = field.size
-    texel = mi.UInt32(dr.clip(uv.y * s, 0, s - 1)) * s + mi.UInt32(dr.clip(uv.x * s, 0, s - 1))
-    group = dr.gather(mi.UInt32, kin.index, texel * NEAREST)  # the nearest
+    group = dr.gather(mi.UInt32, kin.index, nearest_texel(field, uv) * NEAREST)  # the nearest
     one = mi.Float(1)
     now = np.zeros_like(kin.sums)
     for k, alpha in enumerate(LADDER):

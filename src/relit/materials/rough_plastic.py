@@ -144,8 +144,8 @@ def smith_g1(cos, alpha):
 
 
 def base_radiance(diffuse, coat: Coat, cos_v, alpha, entered):
-    """Radiance of the diffuse base through the coat, Color3f. entered: Color3f, irradiance that came through the coat. cos_v: Float, of the
-    viewer's direction."""
+    """Radiance of the diffuse base through the coat, Color3f. entered: Color3f or Float, irradiance that came through the coat.
+    cos_v: Float, of the viewer's direction."""
     return diffuse * entered * (coat.transmittance(cos_v, alpha) / (1 - coat.internal(alpha)) * (dr.inv_pi / coat.ior**2))
 
 
@@ -158,9 +158,8 @@ def evaluate(m: Plastic, coat: Coat, n, v, l):
     h = dr.normalize(v + l)
     n_dot_h, v_dot_h = dr.clip(dr.dot(n, h), 0, 1), dr.clip(dr.dot(v, h), 0, 1)
     lobe = fresnel(v_dot_h, coat.ior) * ggx_d(n_dot_h, alpha) * smith_g1(n_dot_l, alpha) * smith_g1(n_dot_v, alpha) / (4 * n_dot_v)
-    through = coat.transmittance(n_dot_v, alpha) * coat.transmittance(n_dot_l, alpha)
-    base = through / (1 - coat.internal(alpha)) * (n_dot_l * (dr.inv_pi / coat.ior**2))
-    return mi.Color3f(dr.select(lit, m.diffuse * base + m.specular * lobe, 0))
+    base = base_radiance(m.diffuse, coat, n_dot_v, alpha, coat.transmittance(n_dot_l, alpha) * n_dot_l)
+    return mi.Color3f(dr.select(lit, base + m.specular * lobe, 0))
 
 
 def sample(m: Plastic, n, v, u_lobe, u2):

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.lighting.flash import incident, light_position
+from relit.materials.field import nearest_texel
 from relit.materials.rough_plastic import MIN_ALPHA, Coat, Plastic, base_radiance, evaluate
 from relit.rendering.march import Marched, march, sphere_interval
 
@@ -58,9 +59,8 @@ class AroundTexels:
 
     def at(self, view, uv):
         """Color3f at texture coordinates."""
-        s = self.size
-        texel = mi.UInt32(dr.clip(uv.y * s, 0, s - 1)) * s + mi.UInt32(dr.clip(uv.x * s, 0, s - 1))
-        return dr.gather(mi.Color3f, self.light, view * self.places + dr.gather(mi.UInt32, self.place, texel))
+        place = dr.gather(mi.UInt32, self.place, nearest_texel(self, uv))
+        return dr.gather(mi.Color3f, self.light, view * self.places + place)
 
 
 class FlashAppearance:
