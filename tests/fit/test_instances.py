@@ -12,7 +12,7 @@ from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_growth import Growth, grow, linked_poses
 from relit.fit.instance_lookup import look_for
-from relit.fit.instance_search import APART, Guesses, Search, ambiguous, crops_of, first_pairs, place, reconsider, trusted
+from relit.fit.instance_search import APART, Guesses, Search, ambiguous, crops_of, first_pairs, nearer, place, reconsider, trusted
 from relit.fit.instances import (
     albedo_render,
     carved,
@@ -204,13 +204,17 @@ def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
     crops = crops_of(views)
     wrong = exp_so3(np.array([0.0, np.radians(70), 0.0]))
     poses = truth.copy()
-    poses[1] = similarity(wrong, np.zeros(3)) @ truth[1]
-    o = Search(nodes=24, steps=12, viewpoints=300, doubted=1)
-    found, _, moved = reconsider(views, crops, crop_rings(crops, parts), poses, np.array([0.9, 0.6, 0.9, 0.9]), o, seed=0, parts=parts)
-    assert moved == 1 and rotation_angle(found[1][:3, :3].T @ truth[1][:3, :3]) < 15
+    poses[1] = wrong_pose = similarity(wrong, np.zeros(3)) @ truth[1]
+    o, scores = Search(nodes=24, steps=12, viewpoints=300, doubted=1), np.array([0.9, 0.6, 0.9, 0.9])
+    found, _, moved = reconsider(views, crops, crop_rings(crops, parts), poses.copy(), scores, o, seed=0, parts=parts)
+    assert moved == [1] and rotation_angle(found[1][:3, :3].T @ truth[1][:3, :3]) < 15
     assert np.array_equal(found[[0, 2, 3]], truth[[0, 2, 3]])
     again = reconsider(views, crops, crop_rings(crops, parts), found.copy(), np.array([0.9, 0.6, 0.9, 0.9]), o, seed=0, parts=parts)
-    assert again[2] == 0  # what stands rightly stays
+    assert again[2] == []  # what stands rightly stays
+    rings, all_four = crop_rings(crops, parts), replace(o, doubted=4)
+    left = reconsider(views, crops, rings, poses.copy(), scores, all_four, seed=0, parts=parts, sure={0, 1, 2, 3})
+    assert np.array_equal(left[0], poses) and left[2] == []  # who is sure is not asked
+    assert nearer(found[1], truth[1], wrong_pose) and not nearer(wrong_pose, truth[1], wrong_pose)
 
 
 def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead():

@@ -28,7 +28,7 @@ from relit.geometry.sdf import dense_values, row_features
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.run import run_arrays
 
-HOLD = 40  # steps of the volume pass before poses move
+HOLD = 40  # steps of a volume pass of one level before poses move
 
 
 def shape_stages(
@@ -154,8 +154,15 @@ def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: D
     rate = pose_rate(views, options)
     if rate > 0:
         move_poses(bank, model)
-    o = VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=HOLD)
-    fit_volume(bank, model, o, stage, seed, hold_distances if rate > 0 else None)
+    # on a coarse grid the shape is wrong by more than the poses, which would follow it away from where they are
+    hold = options.level_steps[0] if len(options.levels) > 1 else HOLD
+    o = VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=hold)
+
+    def begin_level(model: VolumeModel) -> None:
+        if rate > 0 and model.grid.n not in options.levels[:2]:
+            hold_distances(model)
+
+    fit_volume(bank, model, o, stage, seed, begin_level)
     return model, bank, moved_poses(bank, views, poses)
 
 

@@ -174,14 +174,14 @@ def descend(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=P
     return poses, scores
 
 
-def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=PARTS, say=lambda text: None):
-    """Search the instances that agree least once more, each against a model of all others; (poses, scores, number that moved).
+def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=PARTS, sure=frozenset(), say=lambda text: None):
+    """Search the instances that agree least once more, each against a model of all others; (poses, scores, indices of those that moved).
 
     An instance in a wrong place has shaped the model that it is compared with, and so agrees with it; a model without it has no such
-    opinion.
+    opinion. sure: indices of instances that are not asked.
     """
-    moved = 0
-    for turn, k in enumerate(np.argsort(scores)[: o.doubted]):
+    moved = []
+    for turn, k in enumerate([k for k in np.argsort(scores)[: o.doubted].tolist() if k not in sure]):
         rest = [j for j in range(len(views)) if j != k]
         some = [views[j] for j in rest]
         values = carved(some, poses[rest], o.nodes, 0.15 if len(rest) < 4 else 0.3, o.depth)
@@ -199,8 +199,14 @@ def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, part
                 best, score = other, also
         if score[0] > before + 0.01 and rotation_angle(best[0][:3, :3].T @ poses[k][:3, :3]) > 8:
             say(f"{views[k].label} agrees better elsewhere with the model of the others: {before:.3f} -> {score[0]:.3f}")
-            poses[k], moved = best[0], moved + 1
+            poses[k] = best[0]
+            moved.append(k)
     return poses, scores, moved
+
+
+def nearer(pose: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether a pose (4, 4) is turned less against a than against b."""
+    return rotation_angle(pose[:3, :3].T @ a[:3, :3]) < rotation_angle(pose[:3, :3].T @ b[:3, :3])
 
 
 def ambiguous(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0) -> np.ndarray:
@@ -272,13 +278,15 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     poses, scores = settle(views, crops, rings[parts], poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
     poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
     detail = crop_rings(crops, DETAILED)  # colour alone puts a spotted cow on any of its white sides
-    late = False
+    late, sure = False, set()
     for turn in range(o.rounds_doubted if o.descents and len(views) > 2 else 0):
-        poses, scores, moved = reconsider(views, crops, detail, poses, scores, o, seed=seed + 30 + turn, parts=DETAILED, say=say)
+        before = poses.copy()
+        poses, scores, moved = reconsider(views, crops, detail, poses, scores, o, seed=seed + 30 + turn, parts=DETAILED, sure=sure, say=say)
         if not moved:
             break
-        late = True
+        late, sent = True, poses.copy()
         poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 40 + turn, parts=parts, say=say)
+        sure |= {k for k in moved if nearer(poses[k], before[k], sent[k])}  # brought back: asked again, they would be sent again
     for turn in range(o.late if late else 0):  # those that came late have had the fewest descents, and hold the others back
         before = poses.copy()
         poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 50 + turn, parts=parts, say=say)

@@ -217,8 +217,7 @@ def move_poses(bank: PixelBank, model: VolumeModel, distances: bool = True) -> N
 
 
 def hold_distances(model: VolumeModel) -> None:
-    """Change the distances of `move_poses` no more. What they have to mend is large, and done on a coarse grid; on a fine one their steps
-    shake the size of every instance, and turns suffer."""
+    """Change the distances of `move_poses` no more. On a fine grid their steps shake the size of every instance, and turns suffer."""
     rates = np.array(model.extra["correction_rates"]).reshape(-1, 8)
     rates[:, 7] = 0
     model.extra["correction_rates"] = mi.Float(rates.ravel())
