@@ -166,6 +166,31 @@ def test_what_a_wrongly_placed_instance_shows_stands_out(pile, tmp_path):
     assert errors[1][2] > 1.3 * np.delete(errors[1], 2).max()  # of four in a short fit, the others suffer too
 
 
+def test_poses_wait_for_the_coarse_level_and_distances_move_on_the_middle_one(pile, tmp_path, monkeypatch):
+    capture, options = open_capture(pile), small_options(levels=(16, 24, 32), level_steps=(6, 6, 6), rays=256)
+    shots = [(p.load(), p.camera.with_pose(np.eye(4))) for p in capture.photos]
+    views, poses = poses_stage.all_views(shots, options.side, options), true_poses(pile)
+    seen, fit = [], shape.fit_volume
+
+    def watched(bank, model, o, stage, seed, begin_level):
+        def begin(model):
+            begin_level(model)
+            seen.append((np.array(bank.corrections).reshape(-1, 8), np.array(model.extra["correction_rates"]).reshape(-1, 8)))
+
+        return fit(bank, model, o, stage, seed, begin)
+
+    monkeypatch.setattr(shape, "fit_volume", watched)
+    with Run.open(tmp_path / "run", {}) as run, run.stage("volume", steps=18, title="volume") as stage:
+        _, bank, _ = shape.shape_and_poses(views, poses, run, stage, options, 0)
+    last = np.array(bank.corrections).reshape(-1, 8)
+    (coarse, rates), (middle, then) = seen
+    assert not coarse.any() and middle[:, :3].any() and middle[:, 7].any()  # nothing moves on the coarse grid
+    assert (rates[:, 7] == 1).all() and (then[:, 7] == 0).all() and (then[:, :6] == 1).all()
+    assert not np.array_equal(last[:, :3], middle[:, :3])
+    own = [c[:, 7] - c[:, 7].mean() for c in (middle, last)]  # what all do in common is taken out of them at every step
+    assert np.allclose(*own, atol=1e-6)
+
+
 def test_odd_instances_are_few_among_many(monkeypatch):
     def found(errors):
         monkeypatch.setattr(odd, "view_errors", lambda *_: np.array(errors))
