@@ -34,7 +34,6 @@ PARTS, COLOURFUL, DETAILED = (0.5, 2.0, 0.6), (0.6, 2.0, 0.1), (0.6, 1.0, 0.1, 0
 STILL = 0.5  # degrees; descents that turn instances by less have arrived
 APART = 25.0  # degrees from which on a pose is another one
 UNSURE = 0.3  # see `ambiguous`
-TOGETHER = 0.1  # gain of two instances together from which on they are tried elsewhere
 GAP = 0.1  # an instance's score may lie so much below those of the best third
 
 
@@ -183,64 +182,26 @@ def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, part
     """
     moved = []
     for turn, k in enumerate([k for k in np.argsort(scores)[: o.doubted].tolist() if k not in sure]):
-        (before, after, pose), *_ = asked(views, crops, rings, poses, [k], o, seed=seed + turn, parts=parts)
-        if after > before + 0.01 and rotation_angle(pose[:3, :3].T @ poses[k][:3, :3]) > 8:
-            say(f"{views[k].label} agrees better elsewhere with the model of the others: {before:.3f} -> {after:.3f}")
-            poses[k] = pose
-            moved.append(k)
-    return poses, scores, moved
-
-
-def asked(views, crops, rings, poses, out: list[int], o: Search, *, seed: int, parts) -> list[tuple[float, float, np.ndarray]]:
-    """For each of the instances `out`: its score where it stands, against a model of all that are not `out`, the best score anywhere, and
-    the pose (4, 4) that has it."""
-    rest = [j for j in range(len(views)) if j not in out]
-    some = [views[j] for j in rest]
-    values = carved(some, poses[rest], o.nodes, 0.15 if len(rest) < 4 else 0.3, o.depth)
-    model, _ = fit_model(some, poses[rest], values, o.steps, seed=seed)
-    render, answers = albedo_render(model), []
-    for k in out:
-        own = chosen_rings(rings, [k])
+        rest = [j for j in range(len(views)) if j != k]
+        some = [views[j] for j in rest]
+        values = carved(some, poses[rest], o.nodes, 0.15 if len(rest) < 4 else 0.3, o.depth)
+        model, _ = fit_model(some, poses[rest], values, o.steps, seed=seed + turn)
+        render, own = albedo_render(model), chosen_rings(rings, [k])
         best, score = refine([crops[k]], poses[[k]], render, rings=own, steps=(0, 4.0, 2.0), parts=parts)
         before = float(score[0])
-        gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed), float(np.linalg.norm(poses[k][:3, 3]))), parts)
+        gallery = make_gallery(
+            render, views_from(directions_around(o.viewpoints, seed + turn), float(np.linalg.norm(poses[k][:3, 3]))), parts
+        )
         found = look_for([views[k]], [crops[k]], gallery, own, parts)
         for n in range(4):
             other, also = refine([crops[k]], found.poses[:, n], render, rings=own, steps=(0, 5.0, 2.5), parts=parts)
             if also[0] > score[0]:
                 best, score = other, also
-        answers.append((before, float(score[0]), best[0]))
-    return answers
-
-
-def reconsider_with_another(views, crops, rings, poses, scores, k: int, o: Search, *, seed: int, parts=PARTS, say=lambda text: None):
-    """Search instance k once more together with each of those that agree least, against a model without both; (poses, indices of the two
-    that moved, or none).
-
-    Two that are wrong in the same way bear each other out: one alone is brought back by the other. The pair that gains most moves.
-    """
-    best, gain = None, TOGETHER
-    for turn, j in enumerate([j for j in np.argsort(scores).tolist() if j != k][: o.doubted // 2]):
-        try:
-            answers = asked(views, crops, rings, poses, [k, j], o, seed=seed + turn, parts=parts)
-        except ValueError:  # the silhouettes of the others have nothing in common
-            continue
-        more = sum(after - before for before, after, _ in answers)
-        if more > gain:
-            best, gain = (j, answers), more
-    if best is None:
-        return poses, []
-    j, answers = best
-    say(f"{views[k].label} and {views[j].label} agree better elsewhere with the model of the others: {gain:.3f} together")
-    poses = poses.copy()
-    poses[[k, j]] = [pose for _, _, pose in answers]
-    return poses, [k, j]
-
-
-def agreement(views, crops, rings, poses, o: Search, *, seed: int, parts=PARTS) -> float:
-    """Mean score of the instances where they stand, against a model of all."""
-    model, _ = fit_model(views, poses, carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True), 2 * o.steps, seed=seed)
-    return float(refine(crops, poses, albedo_render(model), rings=rings, steps=(0, 2.0), parts=parts)[1].mean())
+        if score[0] > before + 0.01 and rotation_angle(best[0][:3, :3].T @ poses[k][:3, :3]) > 8:
+            say(f"{views[k].label} agrees better elsewhere with the model of the others: {before:.3f} -> {score[0]:.3f}")
+            poses[k] = best[0]
+            moved.append(k)
+    return poses, scores, moved
 
 
 def nearer(pose: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
@@ -318,8 +279,7 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
     detail = crop_rings(crops, DETAILED)  # colour alone puts a spotted cow on any of its white sides
     late, sure = False, set()
-    rounds = o.rounds_doubted if o.descents and len(views) > 2 else 0
-    for turn in range(rounds):
+    for turn in range(o.rounds_doubted if o.descents and len(views) > 2 else 0):
         before = poses.copy()
         poses, scores, moved = reconsider(views, crops, detail, poses, scores, o, seed=seed + 30 + turn, parts=DETAILED, sure=sure, say=say)
         if not moved:
@@ -327,19 +287,6 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         late, sent = True, poses.copy()
         poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 40 + turn, parts=parts, say=say)
         sure |= {k for k in moved if nearer(poses[k], before[k], sent[k])}  # brought back: asked again, they would be sent again
-    for turn, k in enumerate(sorted(sure) if len(views) > 4 else ()):
-        some = {"seed": seed + 60 + turn, "parts": DETAILED}
-        tried, moved = reconsider_with_another(views, crops, detail, poses, scores, k, o, **some, say=say)
-        if not moved:
-            continue
-        after, theirs = descend(views, crops, rings[parts], tried, scores, o, seed=seed + 70 + turn, parts=parts, say=say)
-        after, theirs, moved = reconsider(views, crops, detail, after, theirs, o, **some, say=say)
-        if moved:
-            after, theirs = descend(views, crops, rings[parts], after, theirs, o, seed=seed + 80 + turn, parts=parts, say=say)
-        old, new = (agreement(views, crops, detail, p, o, **some) for p in (poses, after))
-        say(f"agreement of all with the model of all {old:.3f} -> {new:.3f}" + ("" if new > old else ": they stay where they were"))
-        if new > old:
-            poses, scores = after, theirs
     for turn in range(o.late if late else 0):  # those that came late have had the fewest descents, and hold the others back
         before = poses.copy()
         poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 50 + turn, parts=parts, say=say)
