@@ -202,17 +202,17 @@ def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
     views, truth = painted([0, 20, 40, 60])
     parts = (0.6, 2.0, 0.1)
     crops = crops_of(views)
+    rings = crop_rings(crops, parts)
     wrong = exp_so3(np.array([0.0, np.radians(70), 0.0]))
     poses = truth.copy()
     poses[1] = wrong_pose = similarity(wrong, np.zeros(3)) @ truth[1]
     o, scores = Search(nodes=24, steps=12, viewpoints=300, doubted=1), np.array([0.9, 0.6, 0.9, 0.9])
-    found, _, moved = reconsider(views, crops, crop_rings(crops, parts), poses.copy(), scores, o, seed=0, parts=parts)
+    found, _, moved = reconsider(views, crops, rings, poses.copy(), scores, o, seed=0, parts=parts)
     assert moved == [1] and rotation_angle(found[1][:3, :3].T @ truth[1][:3, :3]) < 15
     assert np.array_equal(found[[0, 2, 3]], truth[[0, 2, 3]])
-    again = reconsider(views, crops, crop_rings(crops, parts), found.copy(), np.array([0.9, 0.6, 0.9, 0.9]), o, seed=0, parts=parts)
+    again = reconsider(views, crops, rings, found.copy(), scores, o, seed=0, parts=parts)
     assert again[2] == []  # what stands rightly stays
-    rings, all_four = crop_rings(crops, parts), replace(o, doubted=4)
-    left = reconsider(views, crops, rings, poses.copy(), scores, all_four, seed=0, parts=parts, sure={0, 1, 2, 3})
+    left = reconsider(views, crops, rings, poses.copy(), scores, replace(o, doubted=4), seed=0, parts=parts, sure={0, 1, 2, 3})
     assert np.array_equal(left[0], poses) and left[2] == []  # who is sure is not asked
     assert nearer(found[1], truth[1], wrong_pose) and not nearer(wrong_pose, truth[1], wrong_pose)
 
