@@ -48,10 +48,12 @@ from relit.scene import Asset, Camera, Capture, Material, Mesh
 
 __all__ = ["LEAST_PHOTOS", "CollectionOptions", "options_for", "reconstruct"]
 LIGHT = "one light per photo (collection)"
+DIFFUSION = 0.1  # of the volume pass: with quiet masks it needs less smoothing
+EXCHANGE = 14.0  # most of exchange_rate times steps: the lights are flatter than true ones, and highlights then ask for ever more of them
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("links", "poses", "volume", "second_look", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
-COST = {"draft": (150.0, 1.2e9), "standard": (700.0, 2.0e9), "high": (2500.0, 3.0e9)}
+COST = {"draft": (150.0, 1.2e9), "standard": (300.0, 1.5e9), "high": (2500.0, 3.0e9)}
 
 
 def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0) -> Asset:
@@ -135,18 +137,19 @@ def judge_poses(scores: np.ndarray, share: float, shots: list[Shot], options: Co
 
 def volume_stage(shots, cameras, weights, linked, tints, run, options: CollectionOptions, seed: int):
     """(pixel bank with the final cameras, cameras, model). Poses that come from matches move at a third of the others' rate."""
-    masks = [s.mask for s in shots]
-    bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], masks), weights, seed)
+    silhouettes = [s.mask for s in shots]
+    bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], silhouettes), weights, seed)
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
-    levels, steps = (options.levels, options.level_steps)
+    levels, steps, masks = options.levels, options.level_steps, options.mask_weights
     if "coarse_to_fine" in options.without:
-        levels, steps = levels[-1:], (sum(steps),)
-    values = hull_of(cameras, masks, levels[0])
+        levels, steps, masks = levels[-1:], (sum(steps),), masks[-1:]
+    values = hull_of(cameras, silhouettes, levels[0])
     model = start_model(values, np.full(3, GREY), None, full=False)
     model.reflections, model.rates = start_photo_lights(tints, GREY)
     model.appearance = shade_photos
     model.extra["correction_rates"] = mi.Float(np.repeat(np.where(linked, 0.3, 1.0), 7).astype(np.float32))
-    o = VolumeOptions(levels, steps, options.rays, sharpness=(1.5, 6.0), refine_cameras=options.refine_cameras)
+    calm = {"mask": masks, "diffusion": DIFFUSION, "sharpness": (1.5, 6.0)}
+    o = VolumeOptions(levels, steps, options.rays, refine_cameras=options.refine_cameras, **calm)
     if run.done("volume"):
         restore_model(model, bank, run_arrays(run, "volume", "checkpoint"))
     else:
@@ -211,11 +214,17 @@ def mesh_stage(model: VolumeModel, run, options: CollectionOptions) -> dict[str,
     return parts
 
 
+def surface_options(options: CollectionOptions) -> SurfaceOptions:
+    """Of the surface pass: longer passes do not exchange more scale between lights and base colour."""
+    own = SurfaceOptions(options.surface_steps, options.points, options.directions, options.texture)
+    return replace(own, exchange_rate=min(own.exchange_rate, EXCHANGE / max(own.steps, 1)))
+
+
 def surface_stage(bank: PixelBank, mesh: Mesh, albedo, tints, run, options: CollectionOptions, seed: int) -> dict[str, np.ndarray]:
     """Material and lights. Returns (and keeps) base_color, roughness, metallic, normal, lights (V, ROWS, COLUMNS, 3) in the unit frame."""
     if run.done("surface"):
         return run_arrays(run, "surface", "maps")
-    o = SurfaceOptions(options.surface_steps, options.points, options.directions, options.texture)
+    o = surface_options(options)
     with run.stage("surface", steps=o.steps, title="material and lights (surface pass)") as stage:
         face, bary = rasterise_atlas(mesh, o.texture)
         known = face >= 0

@@ -17,7 +17,8 @@ class CollectionOptions:
     'soft': several, by SAMURAI's shares with memory and momentum. hints: whether quadrants or angles are used. holdout: every so many
     photos are set aside (0: none but those of held_out.json). starts: photos that growth begins from without hints, where pairs hold too
     few together. least_score: of the registration, on average, and least_agreement: share of photos that find their place in a model of
-    the others, below which the poses are taken for wrong. levels, level_steps, rays: of the volume pass. refine_cameras: step of the
+    the others, below which the poses are taken for wrong. levels, level_steps, rays: of the volume pass; mask_weights: of its
+    mask term, level by level: outlines of masks wander, and the surface would follow them into bumps. refine_cameras: step of the
     camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass. frozen_steps: of the fit of
     held-out photos. light_network: folder of Neural-PIL's network, which then takes the place of the shipped prior of lights.
     init_colour: weight of SAMURAI's L_init in the surface pass, a tenth of it after the share lambda_a of its steps (80k of 300k in the
@@ -34,13 +35,14 @@ class CollectionOptions:
     starts: int = 4
     least_score: float = 0.84
     least_agreement: float = 0.2
-    levels: tuple[int, ...] = (64, 128)
-    level_steps: tuple[int, ...] = (400, 500)
+    levels: tuple[int, ...] = (64, 128, 192)
+    level_steps: tuple[int, ...] = (400, 500, 400)
+    mask_weights: tuple[float, ...] = (0.8, 0.2, 0.1)
     rays: int = 6144
     refine_cameras: float = 0.003
     faces: int = 30_000
     texture: int = 512
-    surface_steps: int = 700
+    surface_steps: int = 1500
     points: int = 4096
     directions: int = 32
     frozen_steps: int = 150

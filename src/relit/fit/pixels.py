@@ -13,7 +13,6 @@ from scipy.ndimage import binary_dilation
 from relit.cameras.se3 import exp_so3
 from relit.scene import Camera
 
-ZOOM = 4.0  # a focal length is known less well than a pose is: it moves so much faster
 SATURATED = 0.99  # of photos whose values end at 1
 CAMERA_FLOATS = 16  # fx fy cx cy, then the 3x4 pose row by row
 
@@ -135,7 +134,7 @@ def rays_through(cameras, view, x, y, corrections=None):
 
     A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by the translation, both in the unit frame.
     Where corrections have seven numbers a view, the camera turns about the ORIGIN of the unit frame (a viewpoint that is wrong is put right
-    without moving the picture), then moves, and the seventh is 1 / ZOOM of the logarithm of a factor on the focal lengths and on the
+    without moving the picture), then moves, and the seventh is the logarithm of a factor on the focal lengths and on the
     distance from the origin together (what stands there keeps its size in the picture; only the perspective changes). An eighth is the
     logarithm of a factor on the distance alone: among the translations, which are in the axes of the unit frame, it would be lost beside
     what moves the picture aside.
@@ -144,7 +143,7 @@ def rays_through(cameras, view, x, y, corrections=None):
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
     each = 6 if corrections is None else dr.width(corrections) * CAMERA_FLOATS // dr.width(cameras)
     if each > 6:
-        zoom = dr.exp(-ZOOM * dr.gather(mi.Float, corrections, view * each + 6))
+        zoom = dr.exp(-dr.gather(mi.Float, corrections, view * each + 6))
         lx, ly = lx * zoom, ly * zoom
     d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
     o = mi.Vector3f(k[1].w, k[2].w, k[3].w)
@@ -172,7 +171,7 @@ def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
         turn, zoom = exp_so3(c[:3]), 1.0
         pose[:3, :3] = turn @ pose[:3, :3]
         if len(c) > 6:
-            zoom = float(np.exp(ZOOM * c[6]))
+            zoom = float(np.exp(c[6]))
             pose[:3, 3] = zoom * (turn @ pose[:3, 3])
         if len(c) > 7:
             pose[:3, 3] *= np.exp(c[7])

@@ -7,7 +7,7 @@ Levels double the grid; between levels the field is made a distance again and th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -41,7 +41,8 @@ class VolumeOptions:
     """One entry of `levels` and `steps` per level (nodes a side, optimisation steps). rays: rays per step.
 
     sdf_rate: largest move of a distance per step, in voxels; feature_rate: of a feature. sharpness: inv_s * h at the start and the end of a
-    level. step: smallest marching step in voxels. eikonal, mask, normal: weights of the terms. diffusion: per step the field moves by
+    level. step: smallest marching step in voxels. eikonal, mask, normal: weights of the terms; mask for each level, the last one for all
+    further ones. diffusion: per step the field moves by
     -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the value: noise of the grid's own scale dies out,
     curvature stays. band: half width of the optimised band, voxels. calm: see Adam's floor: distances with little evidence, such as
     under a glossy coat, are left to the smoothing. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
@@ -57,7 +58,7 @@ class VolumeOptions:
     step: float = 0.9
     eikonal: float = 0.1
     diffusion: float = 0.2
-    mask: float = 0.8
+    mask: tuple[float, ...] = (0.8,)
     normal: float = 0.05
     band: float = 5.0
     calm: float = 0.5
@@ -149,8 +150,9 @@ def fit_volume(
             break
         if begin_level is not None and number > 0:
             begin_level(model)
+        own = replace(options, mask=options.mask[min(number, len(options.mask) - 1) :])
         span = {"first": max(start, done), "begin": done, "end": done + steps}
-        _fit_level(bank, model, options, stage, camera_adam, **span, saved=saved, seed=seed)
+        _fit_level(bank, model, own, stage, camera_adam, **span, saved=saved, seed=seed)
         done += steps
     stage.save("checkpoint", step=done, **_state(model, bank))  # a stop during the mesh stage need not come back here
     return model
@@ -175,6 +177,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
     if first > begin:  # the next level has a grid of its own
         recall(saved, rng, adam)
     dt = dr.opaque(mi.Float, options.step * h)
+    masks = dr.opaque(mi.Float, options.mask[0])
 
     def step(i: int) -> dict:
         e = (i - begin) / max(end - begin, 1)
@@ -212,7 +215,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         if bank.masked:
             term = mask_loss(m.opacity, batch.mask)
             report["mask"] = term
-            loss = loss + options.mask * term
+            loss = loss + masks * term
         if batch.normal is not None:
             loss = loss + options.normal * normal_loss(normal, batch.normal, batch.has_normal * dr.detach(m.opacity))
         dr.backward(loss)
