@@ -60,8 +60,16 @@ def test_a_weight_is_that_of_its_level_and_the_last_one_of_all_further_levels(ph
     from relit.fit import volume
 
     heard = []
-    monkeypatch.setattr(volume, "_fit_level", lambda bank, model, options, *a, **k: heard.append((model.grid.n, options.mask[0])))
+    monkeypatch.setattr(volume, "_fit_level", lambda bank, model, *a, **k: heard.append((model.grid.n, k["mask"])))
     monkeypatch.setitem(LEVELS, "levels", (16, 24, 32))
     monkeypatch.setitem(LEVELS, "steps", (1, 1, 1))
     fitted(photos[:6], mask=(0.8, 0.1))
     assert heard == [(16, 0.8), (24, 0.1), (32, 0.1)]
+
+
+@pytest.mark.parametrize("weights", [(), (0.8, -0.1)])
+def test_senseless_weights_are_refused(weights):
+    from relit.fit.collection_options import CollectionOptions
+
+    with pytest.raises(ValueError, match="mask_weights"):
+        CollectionOptions(mask_weights=weights)

@@ -65,6 +65,8 @@ class CollectionOptions:
     def __post_init__(self):
         if self.lambda_a <= 0 or min(self.lambda_c) <= 0:
             raise ValueError("lambda_a and lambda_c must be positive")
+        if not self.mask_weights or min(self.mask_weights) < 0:
+            raise ValueError("mask_weights must be at least one number, none of them negative")
         check_parts(self.without, WITHOUT)
 
 

@@ -7,7 +7,7 @@ Levels double the grid; between levels the field is made a distance again and th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -42,10 +42,10 @@ class VolumeOptions:
 
     sdf_rate: largest move of a distance per step, in voxels; feature_rate: of a feature. sharpness: inv_s * h at the start and the end of a
     level. step: smallest marching step in voxels. eikonal, mask, normal: weights of the terms; mask for each level, the last one for all
-    further ones. diffusion: per step the field moves by
-    -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the value: noise of the grid's own scale dies out,
-    curvature stays. band: half width of the optimised band, voxels. calm: see Adam's floor: distances with little evidence, such as
-    under a glossy coat, are left to the smoothing. refine_cameras: step of the camera corrections (radians, unit lengths), 0 for fixed.
+    further ones. diffusion: per step the field moves by -diffusion L L S (decaying like the rates), L the mean of the neighbours minus the
+    value: noise of the grid's own scale dies out, curvature stays. band: half width of the optimised band, voxels. calm: see Adam's floor:
+    distances with little evidence, such as under a glossy coat, are left to the smoothing. refine_cameras: step of the camera corrections
+    (radians, unit lengths), 0 for fixed.
     hold: steps before the cameras move: they would follow the shape that the pass begins with.
     """
 
@@ -150,15 +150,15 @@ def fit_volume(
             break
         if begin_level is not None and number > 0:
             begin_level(model)
-        own = replace(options, mask=options.mask[min(number, len(options.mask) - 1) :])
+        weight = options.mask[min(number, len(options.mask) - 1)]
         span = {"first": max(start, done), "begin": done, "end": done + steps}
-        _fit_level(bank, model, own, stage, camera_adam, **span, saved=saved, seed=seed)
+        _fit_level(bank, model, options, stage, camera_adam, **span, mask=weight, saved=saved, seed=seed)
         done += steps
     stage.save("checkpoint", step=done, **_state(model, bank))  # a stop during the mesh stage need not come back here
     return model
 
 
-def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, saved, seed):
+def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, mask, saved, seed):
     grid = model.grid
     h, count = grid.h, options.rays
     rng = mi.PCG32(size=count, initstate=seed * 7919 + begin)
@@ -177,7 +177,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
     if first > begin:  # the next level has a grid of its own
         recall(saved, rng, adam)
     dt = dr.opaque(mi.Float, options.step * h)
-    masks = dr.opaque(mi.Float, options.mask[0])
+    mask = dr.opaque(mi.Float, mask)
 
     def step(i: int) -> dict:
         e = (i - begin) / max(end - begin, 1)
@@ -215,7 +215,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, s
         if bank.masked:
             term = mask_loss(m.opacity, batch.mask)
             report["mask"] = term
-            loss = loss + masks * term
+            loss = loss + mask * term
         if batch.normal is not None:
             loss = loss + options.normal * normal_loss(normal, batch.normal, batch.has_normal * dr.detach(m.opacity))
         dr.backward(loss)
