@@ -4,7 +4,8 @@
     links        groups of photos whose features match                              cameras/links.py, fit/collection_links.py
     poses        coarse models and registration by rendering, in turns, from quadrants or one silhouette    fit/collection_poses.py
     volume       signed distance field, one small light per photo, cameras and focal lengths free           fit/volume.py
-    second_look  photos that were put in a wrong place are searched for in the finished shape               fit/collection_held_out.py
+    second_look  photos that were put in a wrong place are searched for in the finished shape, and told by fine detail
+                                                                          fit/collection_held_out.py, fit/fine_detail.py
     mesh         zero level set, decimated; texture atlas
     surface      metallic-roughness textures, one environment per photo                                     fit/collection_surface.py
     held_out     camera and light of photos that were set aside, with the model frozen
@@ -69,7 +70,7 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
     parts = mesh_stage(model, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     maps = surface_stage(bank, mesh, parts["albedo"], tints, run, options, seed)
-    found = held_out_stage(held, model, mesh, parts["albedo"], maps, cameras, degrees, run, options, seed)
+    found = held_out_stage(held, shots, model, mesh, parts["albedo"], maps, cameras, degrees, run, options, seed)
     return assemble(shots + held, cameras + found[0], np.concatenate([maps["lights"], found[1]]), mesh, maps, [s.photo.name for s in held])
 
 

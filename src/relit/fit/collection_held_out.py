@@ -14,12 +14,14 @@ from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_photos import Shot, crops_of
 from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, best_refined
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, start_collection_surface
+from relit.fit.fine_detail import detail_of, laid_on, surface_of, told_apart
 from relit.fit.loop import NoStage
 from relit.fit.pixels import corrected, make_bank
 from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, near, refine, search, views_from, volume_render
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
-from relit.geometry.mesh import vertex_areas
+from relit.geometry.mesh import extract_mesh, vertex_areas
+from relit.geometry.sdf import dense_values
 from relit.lighting.per_photo import COLUMNS, ROWS
 from relit.materials.field import start_material
 from relit.rendering.shade_photos import shade_photos, shade_plain, start_photo_lights
@@ -28,28 +30,34 @@ from relit.run import run_arrays
 from relit.scene import Camera
 
 AGAIN = 600  # viewpoints that a finished model is looked at from
+CHOICES = 6  # places of each photo that are looked into
+ELSEWHERE = 20.0  # degrees: what is nearer is found by descent
+FAR = 30.0  # degrees from which on fine detail decides
+WORSE = 0.06  # by which the score of a place may be lower for fine detail to decide
 GAIN = 0.03  # by which another pose must score better than the present one: sides that look alike differ by .01 from light alone
 
 
-def held_out_stage(held: list[Shot], model: VolumeModel, mesh, albedo, maps, cameras, degrees, run, options: CollectionOptions, seed: int):
-    """(cameras, lights (H, ROWS, COLUMNS, 3)) of the held-out photos: registered by rendering, descended, lit; model and material stay."""
+def held_out_stage(held, shots, model: VolumeModel, mesh, albedo, maps, cameras, degrees, run, options: CollectionOptions, seed: int):
+    """(cameras, lights (H, ROWS, COLUMNS, 3)) of the held-out photos: registered by rendering and by what the others (`shots`, their
+    `cameras`) show, descended, lit; model and material stay."""
     if not held:
         return [], np.zeros((0, ROWS, COLUMNS, 3), np.float32)
     if run.done("held_out"):
         kept = run_arrays(run, "held_out", "photos")
     else:
         with run.stage("held_out", steps=options.frozen_steps, title="photos that were set aside") as stage:
-            shots = [replace(s, camera=with_median_field(s, cameras)) for s in held]
-            found = register(shots, model, degrees, options, seed)
-            found = descend(shots, found, model, options, seed)
-            bank = make_bank(found, [s.rgb for s in shots], [s.mask for s in shots])
+            new = [replace(s, camera=with_median_field(s, cameras)) for s in held]
+            found = register(new, model, degrees, options, seed)
+            found = descend(new, found, model, options, seed)
+            found = told_by_others(new, found, shots, cameras, mesh, model, degrees, options, seed)
+            bank = make_bank(found, [s.rgb for s in new], [s.mask for s in new])
             size = maps["roughness"].shape[0]
             material = start_material(size, maps["base_color"], 0.5, 0.0)
             material.colour = mi.Float(np.concatenate([maps["base_color"], maps["roughness"][..., None]], -1).astype(np.float32).ravel())
             material.metallic = mi.Float(maps["metallic"].astype(np.float32).ravel())
             n = maps["normal"]
             material.slope = mi.Float((n[..., :2] / np.maximum(n[..., 2:], 0.1)).astype(np.float32).ravel())
-            lit = start_collection_surface(material, np.array([s.tint for s in shots]), ALBEDO_START, light_family(options))
+            lit = start_collection_surface(material, np.array([s.tint for s in new]), ALBEDO_START, light_family(options))
             areas = vertex_areas(mesh)
             scale = ALBEDO_START / float((albedo * areas[:, None]).sum() / areas.sum() / 3)
             o = SurfaceOptions(options.frozen_steps, options.points, options.directions, size)
@@ -72,8 +80,8 @@ def with_median_field(shot: Shot, cameras: list[Camera]) -> Camera:
     return replace(shot.camera, fx=focal, fy=focal)
 
 
-def find(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int, slid: bool = False):
-    """(crops, their descriptors, what renders the model, hypotheses of every photo) by search from all around. slid: those
+def find(shots: list[Shot], model: VolumeModel, degrees: float, keep: int, seed: int, slid: bool = False):
+    """(crops, their descriptors, what renders the model, `keep` hypotheses of every photo) by search from all around. slid: those
     that the frame cuts with place and size free (takes a second a photo)."""
     crops, hints = crops_of(shots), np.array([s.direction for s in shots])
     render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops, PARTS)
@@ -81,46 +89,74 @@ def find(shots: list[Shot], model: VolumeModel, degrees: float, options: Collect
     hinted = np.linalg.norm(hints, axis=1) > 0.5
     prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * hinted[:, None, None]
     allowed = near(gallery, hints, degrees + SLACK) | ~hinted[:, None]
-    found = search(crops, gallery, options.hypotheses, rings=rings, prior=prior, allowed=allowed)
+    found = search(crops, gallery, keep, rings=rings, prior=prior, allowed=allowed)
     cut = np.flatnonzero([is_cut(c) for c in crops])
     if slid and len(cut):
-        more = slide([crops[i] for i in cut], render, gallery.cameras, options.hypotheses, allowed[cut], prior[cut].max(2))
+        more = slide([crops[i] for i in cut], render, gallery.cameras, keep, allowed[cut], prior[cut].max(2))
         found.poses[cut], found.scores[cut] = more.poses, more.scores
     return crops, rings, render, found
 
 
 def register(shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int) -> list[Camera]:
     """The cameras of photos that the model has not seen, by search and local refinement."""
-    crops, rings, render, found = find(shots, model, degrees, options, seed, slid=True)
+    crops, rings, render, found = find(shots, model, degrees, options.hypotheses, seed, slid=True)
     poses, _ = best_refined(crops, found, render, rings, options.hypotheses)
     return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)]
 
 
+def told_by_others(new, found: list[Camera], shots, cameras, mesh, model: VolumeModel, degrees, options: CollectionOptions, seed: int):
+    """The cameras `found` of `new` photos, but for those that from elsewhere show more of what `shots` show there."""
+    places = far_from(found, other_places(new, found, model, degrees, np.zeros(len(new), bool), options, seed))
+    if not places:
+        return found
+    surface = surface_of(mesh)
+    laid = np.array([laid_on(surface, c, detail_of(s.rgb, s.mask)) for c, s in zip(cameras, shots, strict=True)])
+    told = told_apart(surface, [detail_of(s.rgb, s.mask) for s in new], found, places, laid)
+    return [told.get(i, c) for i, c in enumerate(found)]
+
+
 def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, degrees: float, still, options: CollectionOptions, seed: int):
     """(cameras, numbers of the photos that moved): every photo is searched for in the finished model, whose detail tells apart what the
-    coarse ones took for each other (a stool from above, half a turn away). Those that fit elsewhere by GAIN move there, and descend.
-    still: (P,) bool, photos that stay."""
+    coarse ones took for each other. Photos that fit elsewhere by GAIN move there, and so do those that from elsewhere show more of what
+    the others show there (a stool from above, half a turn away: fit/fine_detail.py). still: (P,) bool, photos that stay."""
+    places = other_places(shots, cameras, model, degrees, still, options, seed)
+    out, moved = list(cameras), {}
+    for i, camera, gain in places:  # the best comes first
+        if gain > GAIN and i not in moved:
+            out[i] = moved[i] = camera
+    told, far = {}, far_from(out, places)
+    if far:
+        surface = surface_of(extract_mesh(dense_values(model.grid), faces=options.faces))
+        told = told_apart(surface, [detail_of(s.rgb, s.mask) for s in shots], out, far)
+    return [told.get(i, c) for i, c in enumerate(out)], sorted(moved | told)
+
+
+def other_places(shots, cameras: list[Camera], model: VolumeModel, degrees: float, still, options: CollectionOptions, seed: int):
+    """[(photo, camera, by how much the score is better than at its own camera)], the best first: where else in the finished model each
+    photo may have been taken, ELSEWHERE away or more, descended."""
     shots = [replace(s, camera=c.with_pose(np.eye(4))) for s, c in zip(shots, cameras, strict=True)]
     present = np.array([c.world_from_camera for c in cameras])
-    crops, rings, render, found = find(shots, model, degrees, options, seed)
-    away = np.array([[rotation_angle(p[:3, :3].T @ q[:3, :3]) > 20 for q in row] for p, row in zip(present, found.poses, strict=True)])
-    best = np.where(away, found.scores, -1).argmax(1)
-    rows = np.arange(len(shots))
+    crops, rings, render, found = find(shots, model, degrees, CHOICES if options.hypotheses > 1 else 1, seed)
     _, height = refine(crops, present, render, rings=rings, steps=(0,), parts=PARTS)
     still = still | np.array([is_cut(c) for c in crops])  # whole silhouettes are compared: they tell nothing of cut ones
-    tried = np.flatnonzero(~still & away[rows, best] & (found.scores[rows, best] > height - 0.06))
-    if not len(tried):
-        return cameras, []
-    some = [crops[i] for i in tried]
-    other, score = refine(some, found.poses[tried, best[tried]], render, rings=crop_rings(some, PARTS), steps=COARSE, parts=PARTS)
-    moved = [(int(i), pose) for i, pose, s in zip(tried, other, score, strict=True) if s > height[i] + GAIN]
-    if not moved:
-        return cameras, []
-    out = list(cameras)
-    placed = descend([shots[i] for i, _ in moved], [cameras[i].with_pose(p) for i, p in moved], model, options, seed)
-    for (i, _), camera in zip(moved, placed, strict=True):
-        out[i] = camera
-    return out, [i for i, _ in moved]
+    apart = np.array([[rotation_angle(p[:3, :3].T @ q[:3, :3]) for q in row] for p, row in zip(present, found.poses, strict=True)])
+    photo, which = np.nonzero((found.scores > height[:, None] - 0.1) & (apart > ELSEWHERE) & ~still[:, None])
+    if not len(photo):
+        return []
+    some = [crops[i] for i in photo]
+    poses, scores = refine(some, found.poses[photo, which], render, rings=crop_rings(some, PARTS), steps=COARSE, parts=PARTS)
+    gains = scores - height[photo]
+    kept = [k for k in np.argsort(-gains) if gains[k] > -WORSE]
+    if not kept:
+        return []
+    placed = descend([shots[photo[k]] for k in kept], [cameras[photo[k]].with_pose(poses[k]) for k in kept], model, options, seed)
+    return [(int(photo[k]), camera, float(gains[k])) for k, camera in zip(kept, placed, strict=True)]
+
+
+def far_from(cameras: list[Camera], places) -> list[tuple[int, Camera]]:
+    """(photo, camera) of those of `other_places` that are FAR from where the photo is now."""
+    turns = [c.world_from_camera[:3, :3].T @ cameras[i].world_from_camera[:3, :3] for i, c, _ in places]
+    return [(i, c) for (i, c, _), turn in zip(places, turns, strict=True) if rotation_angle(turn) > FAR]
 
 
 def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, options: CollectionOptions, seed: int) -> list[Camera]:

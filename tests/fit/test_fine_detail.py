@@ -1,0 +1,102 @@
+"""A ball that is alike from all sides but for what is painted on it, under lights of its own in every photo."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from relit.cameras.se3 import look_at
+from relit.conventions import similarity
+from relit.scene import Camera, Material, Mesh
+
+SIZE, SPP = 160, 32
+
+
+def painted_ball(plain: bool) -> tuple[Mesh, Material]:
+    ball = trimesh.creation.uv_sphere(0.6, count=[80, 80])
+    n = np.asarray(ball.vertices, np.float64) / 0.6
+    uvs = np.stack([np.arctan2(n[:, 1], n[:, 0]) / (2 * np.pi) + 0.5, np.arccos(n[:, 2].clip(-1, 1)) / np.pi], -1)
+    mesh = Mesh(ball.vertices.astype(np.float32), np.asarray(ball.faces, np.int32), n.astype(np.float32), uvs.astype(np.float32))
+    base = np.full((36, 72, 3), 0.4, np.float32) if plain else np.random.default_rng(4).uniform(0.1, 0.8, (36, 72, 3)).astype(np.float32)
+    return mesh, Material(base, np.full((2, 2), 0.6, np.float32), np.zeros((2, 2), np.float32))
+
+
+def turned(camera: Camera, degrees: float) -> Camera:
+    """The camera about the vertical."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    return camera.with_pose(similarity(turn, np.zeros(3)) @ camera.world_from_camera)
+
+
+def photos(plain: bool):
+    """(mesh, pictures, cameras) of twelve photos."""
+    from relit.fit.fine_detail import detail_of
+    from relit.rendering.mitsuba_scene import build_scene, render
+
+    (mesh, material), rng, pictures, cameras = painted_ball(plain), np.random.default_rng(1), [], []
+    for i in range(12):
+        a = 2.4 * i
+        y = 0.2 + 0.6 * (i % 4) / 3
+        eye = 2.2 * np.array([np.sqrt(1 - y * y) * np.cos(a), y, np.sqrt(1 - y * y) * np.sin(a)])
+        camera = Camera(SIZE, SIZE, 1.5 * SIZE, 1.5 * SIZE, SIZE / 2, SIZE / 2, look_at(eye))
+        light = np.full((8, 16, 3), 0.4, np.float32)
+        light[1:3, rng.integers(0, 12) :][:, :3] = rng.uniform(2, 5, 3)
+        picture = render(build_scene(mesh, material, np.eye(4), light), camera, spp=SPP, seed=i)
+        pictures.append(detail_of(picture[..., :3], picture[..., 3]))
+        cameras.append(camera)
+    return mesh, pictures, cameras
+
+
+@pytest.fixture(scope="module")
+def painted(device):
+    return photos(plain=False)
+
+
+def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
+    from relit.fit.fine_detail import surface_of, told_apart
+
+    mesh, pictures, truth = painted
+    cameras = [turned(c, 180) if i in (3, 7) else c for i, c in enumerate(truth)]
+    choices = [(i, turned(c, t)) for i, c in enumerate(cameras) for t in (90, 180, 270)]
+    found = told_apart(surface_of(mesh), pictures, cameras, choices)
+    assert set(found) == {3, 7}
+    for i, camera in found.items():
+        assert np.allclose(camera.world_from_camera, truth[i].world_from_camera, atol=1e-6)
+
+
+def test_a_new_photo_is_held_against_the_others(painted):
+    from relit.fit.fine_detail import laid_on, surface_of, told_apart
+
+    mesh, pictures, truth = painted
+    surface = surface_of(mesh)
+    laid = np.array([laid_on(surface, c, p) for c, p in zip(truth[1:], pictures[1:], strict=True)])
+    wrong = turned(truth[0], 180)
+    choices = [(0, turned(truth[0], t)) for t in (0, 90, 270)]
+    assert told_apart(surface, pictures[:1], [wrong], choices, laid) == {0: choices[0][1]}
+    assert told_apart(surface, pictures[:1], truth[:1], choices[1:], laid) == {}
+
+
+def test_a_plain_ball_tells_nothing(device):
+    from relit.fit.fine_detail import surface_of, told_apart
+
+    mesh, pictures, cameras = photos(plain=True)
+    choices = [(i, turned(c, t)) for i, c in enumerate(cameras) for t in (90, 180, 270)]
+    assert len(told_apart(surface_of(mesh), pictures, cameras, choices)) <= 1
+
+
+def test_likeness_of_poses(painted):
+    from relit.fit.fine_detail import expected, laid_on, likeness, surface_of
+
+    mesh, pictures, cameras = painted
+    surface = surface_of(mesh)
+    laid = np.array([laid_on(surface, c, p) for c, p in zip(cameras, pictures, strict=True)])
+    side = (np.asarray(mesh.vertices) @ cameras[0].centre) > 0
+    assert np.isfinite(laid[0]).sum() > 100 and not np.isfinite(laid[0][~side]).any()  # it sees its own side alone
+    shown = expected(laid[1:])
+    right = likeness(surface, cameras[0], pictures[0], shown)
+    assert right > 0.5
+    for degrees in (3, 90, 180):
+        own = likeness(surface, turned(cameras[0], degrees), pictures[0], shown)
+        assert own > right - 0.15 if degrees == 3 else own < 0.3
+    behind = cameras[0].with_pose(look_at(cameras[0].centre, 2 * cameras[0].centre))
+    assert likeness(surface, behind, pictures[0], shown) == -1
+    assert np.isnan(expected(laid[:3])).all()  # too few see anything
