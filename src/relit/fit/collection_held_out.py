@@ -139,14 +139,15 @@ def other_places(shots, cameras: list[Camera], model: VolumeModel, degrees: floa
     crops, rings, render, found = find(shots, model, degrees, CHOICES if options.hypotheses > 1 else 1, seed)
     _, height = refine(crops, present, render, rings=rings, steps=(0,), parts=PARTS)
     still = still | np.array([is_cut(c) for c in crops])  # whole silhouettes are compared: they tell nothing of cut ones
-    apart = np.array([[rotation_angle(p[:3, :3].T @ q[:3, :3]) for q in row] for p, row in zip(present, found.poses, strict=True)])
+    apart = np.array([[turn_between(p, q) for q in row] for p, row in zip(present, found.poses, strict=True)])
     photo, which = np.nonzero((found.scores > height[:, None] - 0.1) & (apart > ELSEWHERE) & ~still[:, None])
     if not len(photo):
         return []
     some = [crops[i] for i in photo]
     poses, scores = refine(some, found.poses[photo, which], render, rings=crop_rings(some, PARTS), steps=COARSE, parts=PARTS)
     gains = scores - height[photo]
-    kept = [k for k in np.argsort(-gains) if gains[k] > -WORSE]
+    turns = [turn_between(present[i], p) for i, p in zip(photo, poses, strict=True)]
+    kept = [k for k in np.argsort(-gains) if gains[k] > GAIN or (gains[k] > -WORSE and turns[k] > FAR)]
     if not kept:
         return []
     placed = descend([shots[photo[k]] for k in kept], [cameras[photo[k]].with_pose(poses[k]) for k in kept], model, options, seed)
@@ -155,8 +156,12 @@ def other_places(shots, cameras: list[Camera], model: VolumeModel, degrees: floa
 
 def far_from(cameras: list[Camera], places) -> list[tuple[int, Camera]]:
     """(photo, camera) of those of `other_places` that are FAR from where the photo is now."""
-    turns = [c.world_from_camera[:3, :3].T @ cameras[i].world_from_camera[:3, :3] for i, c, _ in places]
-    return [(i, c) for (i, c, _), turn in zip(places, turns, strict=True) if rotation_angle(turn) > FAR]
+    return [(i, c) for i, c, _ in places if turn_between(cameras[i].world_from_camera, c.world_from_camera) > FAR]
+
+
+def turn_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between two poses (4, 4)."""
+    return rotation_angle(a[:3, :3].T @ b[:3, :3])
 
 
 def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, options: CollectionOptions, seed: int) -> list[Camera]:
