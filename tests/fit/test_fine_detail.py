@@ -1,5 +1,7 @@
 """A ball that is alike from all sides but for what is painted on it, under lights of its own in every photo."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -100,3 +102,30 @@ def test_likeness_of_poses(painted):
     behind = cameras[0].with_pose(look_at(cameras[0].centre, 2 * cameras[0].centre))
     assert likeness(surface, behind, pictures[0], shown) == -1
     assert np.isnan(expected(laid[:3])).all()  # too few see anything
+
+
+def test_photos_in_wrong_places_are_not_borne_out(painted):
+    from relit.fit.fine_detail import borne_out, surface_of
+
+    mesh, pictures, truth = painted
+    surface = surface_of(mesh)
+    wrong = [turned(c, 180) if i in (3, 7) else c for i, c in enumerate(truth)]
+    detail = borne_out(surface, pictures, wrong)
+    assert detail[[3, 7]].max() < 0.25 < np.delete(detail, [3, 7]).min()
+    away = [turned(c, 73 * i) for i, c in enumerate(truth)]
+    assert np.median(borne_out(surface, pictures, away)) < 0.25
+    four = borne_out(surface, pictures[:5], truth[:5])  # a single other photo has to do
+    assert np.median(four) > 0.25
+
+
+def test_what_is_said_of_photos_that_are_not_borne_out():
+    from relit.fit.collection import say_borne_out
+
+    def said(detail):
+        lines = []
+        say_borne_out(np.array(detail), [f"{i}.jpg" for i in range(len(detail))], SimpleNamespace(say=lines.append))
+        return lines
+
+    assert len(said([0.5, 0.6, 0.4])) == 1
+    assert "1.jpg" in said([0.5, 0.1, 0.4])[1] and "0.jpg" not in said([0.5, 0.1, 0.4])[1]
+    assert "most photos" in said([0.5, 0.1, -1.0])[1]

@@ -51,6 +51,7 @@ __all__ = ["LEAST_PHOTOS", "CollectionOptions", "options_for", "reconstruct"]
 LIGHT = "one light per photo (collection)"
 DIFFUSION = 0.1  # of the volume pass: with quiet masks it needs less smoothing
 EXCHANGE = 14.0  # most of exchange_rate times steps: the lights are flatter than true ones, and highlights then ask for ever more of them
+BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to be in its place
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("links", "poses", "volume", "second_look", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
@@ -169,14 +170,31 @@ def second_look_stage(bank: PixelBank, shots, cameras, model: VolumeModel, degre
         kept = run_arrays(run, "second_look", "cameras")
     else:
         with run.stage("second_look", title="lost photos are looked for in the finished shape") as stage:
-            found, moved = look_again(shots, cameras, model, degrees, linked, options, seed)
+            found, moved, detail = look_again(shots, cameras, model, degrees, linked, options, seed)
             named = ", ".join(shots[i].photo.name for i in moved[:5])
             run.say(f"{len(moved)} photos moved to where they fit better{': ' if moved else ''}{named}")
-            kept = {"poses": np.array([c.world_from_camera for c in found]), "focal": np.array([c.fx for c in found])}
+            say_borne_out(detail, [s.photo.name for s in shots], run)
+            kept = {"poses": np.array([c.world_from_camera for c in found]), "focal": np.array([c.fx for c in found]), "detail": detail}
             stage.save("cameras", **kept)
     cameras = [replace(c, fx=f, fy=f, world_from_camera=p) for c, f, p in zip(cameras, kept["focal"], kept["poses"], strict=True)]
     place_cameras(bank, cameras)
     return cameras
+
+
+def say_borne_out(detail: np.ndarray, names: list[str], run) -> None:
+    """Say how many photos show what the others show at the same places. detail: (P,), see `fine_detail.borne_out`."""
+    low = np.flatnonzero(detail < BORNE_OUT)
+    run.say(
+        f"fine detail: {len(detail) - len(low)} of {len(detail)} photos show what the others show at the same places "
+        f"(correlation of {BORNE_OUT} and more; median {np.median(detail):.2f}; -1 where too little is shared)"
+    )
+    if len(low) > 0.5 * len(detail):
+        run.say(
+            "note: most photos are not borne out by the others in fine detail: they are in wrong places, or too far apart, "
+            "or the object is plain or mirrors its surroundings: look at the result; photos between these and masks help"
+        )
+    elif len(low):
+        run.say(f"note: not borne out by the others in fine detail: {', '.join(names[i] for i in low[np.argsort(detail[low])][:5])}")
 
 
 def hull_of(cameras: list[Camera], masks: list[np.ndarray], nodes: int) -> np.ndarray:

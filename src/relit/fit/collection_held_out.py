@@ -14,7 +14,7 @@ from relit.fit.collection_options import CollectionOptions
 from relit.fit.collection_photos import Shot, crops_of
 from relit.fit.collection_poses import COARSE, GREY, PARTS, SLACK, best_refined
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, start_collection_surface
-from relit.fit.fine_detail import detail_of, laid_on, surface_of, told_apart
+from relit.fit.fine_detail import borne_out, detail_of, laid_on, surface_of, told_apart
 from relit.fit.loop import NoStage
 from relit.fit.pixels import corrected, make_bank
 from relit.fit.register import crop_rings, directions_around, hint_prior, make_gallery, near, refine, search, views_from, volume_render
@@ -116,19 +116,20 @@ def told_by_others(new, found: list[Camera], shots, cameras, mesh, model: Volume
 
 
 def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, degrees: float, still, options: CollectionOptions, seed: int):
-    """(cameras, numbers of the photos that moved): every photo is searched for in the finished model, whose detail tells apart what the
-    coarse ones took for each other. Photos that fit elsewhere by GAIN move there, and so do those that from elsewhere show more of what
-    the others show there (a stool from above, half a turn away: fit/fine_detail.py). still: (P,) bool, photos that stay."""
+    """(cameras, numbers of the photos that moved, (P,) `borne_out`): every photo is searched for in the finished model, whose detail tells
+    apart what the coarse ones took for each other. Photos that fit elsewhere by GAIN move there, and so do those that from elsewhere show
+    more of what the others show there (a stool from above, half a turn away: fit/fine_detail.py). still: (P,) bool, photos that stay."""
     places = other_places(shots, cameras, model, degrees, still, options, seed)
     out, moved = list(cameras), {}
     for i, camera, gain in places:  # the best comes first
         if gain > GAIN and i not in moved:
             out[i] = moved[i] = camera
-    told, far = {}, far_from(out, places)
-    if far:
-        surface = surface_of(extract_mesh(dense_values(model.grid), faces=options.faces))
-        told = told_apart(surface, [detail_of(s.rgb, s.mask) for s in shots], out, far)
-    return [told.get(i, c) for i, c in enumerate(out)], sorted(moved | told)
+    surface = surface_of(extract_mesh(dense_values(model.grid), faces=options.faces))
+    pictures = [detail_of(s.rgb, s.mask) for s in shots]
+    far = far_from(out, places)
+    told = told_apart(surface, pictures, out, far) if far else {}
+    out = [told.get(i, c) for i, c in enumerate(out)]
+    return out, sorted(moved | told), borne_out(surface, pictures, out)
 
 
 def other_places(shots, cameras: list[Camera], model: VolumeModel, degrees: float, still, options: CollectionOptions, seed: int):
