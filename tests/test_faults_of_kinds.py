@@ -155,12 +155,14 @@ FAULTS = [
     (pile, labels_of_another_photo, [], 3, "another shape than the photo"),
     (pile, tiny_instances, [], 3, "smaller than 24 pixels"),
     (pile, no_labels, ["--masks", "segment:nowhere.onnx"], 3, "no network at"),
+    (pile, as_it_is, ["--set", "level_steps=5"], 2, "differ in length"),
     (pile, as_it_is, ["--set", "matcher_step=7"], 2, "divisor of 360"),
     (collection, three_photos, [], 3, "at least 4 are needed"),
     (collection, all_centre, [], 3, "Center"),
     (collection, unknown_quadrant, [], 3, "Did you mean 'Above'"),
     (collection, quadrants_of_others, [], 3, "answers for 0 of 6 photos"),
     (collection, empty_masks, [], 3, "all masks are black"),
+    (collection, as_it_is, ["--set", "levels=32"], 2, "differ in length"),
     (collection, as_it_is, ["--set", "light_network=nowhere"], 3, "the light network is not there"),
 ]  # fmt: skip
 KINDS = {flash_capture: "flash", pile: "duplicates", collection: "collection"}

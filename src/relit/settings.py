@@ -58,6 +58,12 @@ def check_parts(without: Iterable[str], known: Iterable[str]) -> None:
             raise ValueError(f"without={name} is not known.{did_you_mean(name, known)} Known: {', '.join(known)}")
 
 
+def check_levels(options) -> None:
+    """Raises UserError (code 2) for options of a recipe whose volume pass has not one number of steps for each level."""
+    if len(options.levels) != len(options.level_steps):
+        raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=EXIT_USAGE)
+
+
 def convert(value, hint):
     """A text or a TOML value -> a value of type `hint`: bool, int, float, str, Literal, tuple/list of those, or one of them or None."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)

@@ -46,6 +46,7 @@ from relit.rendering.shade_photos import shade_photos, start_photo_lights
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
+from relit.settings import check_levels
 
 __all__ = ["LEAST_PHOTOS", "CollectionOptions", "options_for", "reconstruct"]
 LIGHT = "one light per photo (collection)"
@@ -60,6 +61,7 @@ COST = {"draft": (150.0, 1.2e9), "standard": (300.0, 1.5e9), "high": (2500.0, 3.
 
 def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0) -> Asset:
     """Run all stages of the recipe in the run folder; stages that are done are read back."""
+    check_levels(options)
     light_family(options)  # a network that cannot be read is said before anything is searched
     shots, held, degrees = load_shots(capture, options, run)
     tints = np.array([s.tint for s in shots])

@@ -44,6 +44,7 @@ from relit.materials.field import normal_map, pictures
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
+from relit.settings import check_levels
 
 __all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
 LIGHT = "several identical objects under one light are assumed (duplicates)"  # what `relit inspect` says
@@ -55,6 +56,7 @@ COST = {"draft": (60.0, 1.0e9), "standard": (350.0, 2.0e9), "high": (1200.0, 3.0
 
 def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0) -> Asset:
     """Run all stages of the recipe in the run folder; stages that are done are read back."""
+    check_levels(options)
     photos = labelled_photos(capture)
     # each photo's own frame: OpenCV axes, unit lengths of the object
     shots = [(with_normals(p.load(), options), p.camera.with_pose(np.eye(4))) for p in photos]

@@ -47,7 +47,7 @@ from relit.rendering.shade_flash import FlashAppearance, alpha_on, start_learnt
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
-from relit.settings import check_parts, preset
+from relit.settings import check_levels, check_parts, preset
 
 LIGHT = "a flash that moves with the camera, in a dark room"
 STAGES = ("volume", "mesh", "surface")
@@ -142,8 +142,7 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     """Run all stages of the recipe in the run folder; stages that are done are read back. `capture` has cameras and an object sphere."""
     if not capture.has_cameras or capture.sphere is None:
         raise ValueError("reconstruct needs cameras and the object sphere")
-    if len(options.levels) != len(options.level_steps):
-        raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
+    check_levels(options)
     check_backdrop(capture)
     bank, cameras, masks, level = load_pixels(capture, options, run)
     check_photos(bank, cameras, masks, level)

@@ -44,7 +44,7 @@ from relit.rendering.shade import mean_radiance
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
-from relit.settings import check_parts, preset
+from relit.settings import check_levels, check_parts, preset
 
 LIGHT = "one fixed light is assumed (multiview)"  # what `relit inspect` says
 STAGES = ("volume", "mesh", "surface")
@@ -155,8 +155,7 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
     """Run all stages of the recipe in the run folder; stages that are done are read back. `capture` has cameras and an object sphere."""
     if not capture.has_cameras or capture.sphere is None:
         raise ValueError("reconstruct needs cameras and the object sphere")
-    if len(options.levels) != len(options.level_steps):
-        raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=2)
+    check_levels(options)
     bank, cameras, masks, level = load_pixels(capture, options, run)
 
     if run.done("mesh"):
