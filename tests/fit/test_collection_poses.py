@@ -66,9 +66,9 @@ def test_only_the_lost_photo_moves(model, photos):
     cameras = [c for *_, c in some]
     cameras[2] = cameras[2].with_pose(cameras[0].world_from_camera)
     options = CollectionOptions(keep=2, frozen_steps=20, rays=2048, refine_cameras=0.001)
-    found, moved, detail = look_again(shots, cameras, model, 45.0, np.zeros(len(shots), bool), options, 0)
-    assert moved == [2] and detail.shape == (4,) and (np.abs(detail) <= 1).all()
-    assert errors(np.array([c.world_from_camera for c in found]), some).max() < 6.0
+    seen = look_again(shots, cameras, model, 45.0, np.zeros(len(shots), bool), options, 0)
+    assert seen.moved == [2] and seen.detail.shape == seen.as_well.shape == (4,) and (np.abs(seen.detail) <= 1).all()
+    assert errors(np.array([c.world_from_camera for c in seen.cameras]), some).max() < 6.0
 
 
 def test_ablation_without_search_keeps_the_hints(photos):

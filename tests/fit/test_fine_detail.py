@@ -59,8 +59,9 @@ def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
     mesh, pictures, truth = painted
     cameras = [turned(c, 180) if i in (3, 7) else c for i, c in enumerate(truth)]
     choices = [(i, turned(c, t)) for i, c in enumerate(cameras) for t in (90, 180, 270)]
-    found = told_apart(surface_of(mesh), pictures, cameras, choices)
-    assert set(found) == {3, 7}
+    told = told_apart(surface_of(mesh), pictures, cameras, choices)
+    found = told.moved
+    assert set(found) == {3, 7} and not told.as_well
     for i, camera in found.items():
         assert np.allclose(camera.world_from_camera, truth[i].world_from_camera, atol=1e-6)
 
@@ -73,8 +74,8 @@ def test_a_new_photo_is_held_against_the_others(painted):
     laid = np.array([laid_on(surface, c, p) for c, p in zip(truth[1:], pictures[1:], strict=True)])
     wrong = turned(truth[0], 180)
     choices = [(0, turned(truth[0], t)) for t in (0, 90, 270)]
-    assert told_apart(surface, pictures[:1], [wrong], choices, laid) == {0: choices[0][1]}
-    assert told_apart(surface, pictures[:1], truth[:1], choices[1:], laid) == {}
+    assert told_apart(surface, pictures[:1], [wrong], choices, laid).moved == {0: choices[0][1]}
+    assert told_apart(surface, pictures[:1], truth[:1], choices[1:], laid).moved == {}
 
 
 def test_a_plain_ball_tells_nothing(device):
@@ -82,7 +83,8 @@ def test_a_plain_ball_tells_nothing(device):
 
     mesh, pictures, cameras = photos(plain=True)
     choices = [(i, turned(c, t)) for i, c in enumerate(cameras) for t in (90, 180, 270)]
-    assert len(told_apart(surface_of(mesh), pictures, cameras, choices)) <= 1
+    told = told_apart(surface_of(mesh), pictures, cameras, choices)
+    assert len(told.moved) <= 1 and len(told.as_well) >= 6  # and so it is said
 
 
 def test_likeness_of_poses(painted):
@@ -121,11 +123,14 @@ def test_photos_in_wrong_places_are_not_borne_out(painted):
 def test_what_is_said_of_photos_that_are_not_borne_out():
     from relit.fit.collection import say_borne_out
 
-    def said(detail):
-        lines = []
-        say_borne_out(np.array(detail), [f"{i}.jpg" for i in range(len(detail))], SimpleNamespace(say=lines.append))
+    def said(detail, as_well=()):
+        lines, turns = [], np.zeros(len(detail))
+        turns[list(as_well)] = 90.0
+        say_borne_out(np.array(detail), turns, [f"{i}.jpg" for i in range(len(detail))], SimpleNamespace(say=lines.append))
         return lines
 
     assert len(said([0.5, 0.6, 0.4])) == 1
     assert "1.jpg" in said([0.5, 0.1, 0.4])[1] and "0.jpg" not in said([0.5, 0.1, 0.4])[1]
     assert "most photos" in said([0.5, 0.1, -1.0])[1]
+    assert "3.jpg" in said([0.5] * 4, [3])[1] and "alike" not in said([0.5] * 4, [3])[1]
+    assert "alike from several sides" in said([0.5] * 4, [0, 3])[1] and "90 degrees" in said([0.5] * 4, [0, 3])[1]

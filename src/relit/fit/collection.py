@@ -53,6 +53,7 @@ LIGHT = "one light per photo (collection)"
 DIFFUSION = 0.1  # of the volume pass: with quiet masks it needs less smoothing
 EXCHANGE = 14.0  # most of exchange_rate times steps: the lights are flatter than true ones, and highlights then ask for ever more of them
 BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to be in its place
+ALIKE = 0.3  # share of photos that would fit as well elsewhere from which on the object is called alike from several sides
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("links", "poses", "volume", "second_look", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
@@ -172,19 +173,21 @@ def second_look_stage(bank: PixelBank, shots, cameras, model: VolumeModel, degre
         kept = run_arrays(run, "second_look", "cameras")
     else:
         with run.stage("second_look", title="lost photos are looked for in the finished shape") as stage:
-            found, moved, detail = look_again(shots, cameras, model, degrees, linked, options, seed)
-            named = ", ".join(shots[i].photo.name for i in moved[:5])
-            run.say(f"{len(moved)} photos moved to where they fit better{': ' if moved else ''}{named}")
-            say_borne_out(detail, [s.photo.name for s in shots], run)
-            kept = {"poses": np.array([c.world_from_camera for c in found]), "focal": np.array([c.fx for c in found]), "detail": detail}
+            seen = look_again(shots, cameras, model, degrees, linked, options, seed)
+            named = ", ".join(shots[i].photo.name for i in seen.moved[:5])
+            run.say(f"{len(seen.moved)} photos moved to where they fit better{': ' if seen.moved else ''}{named}")
+            say_borne_out(seen.detail, seen.as_well, [s.photo.name for s in shots], run)
+            poses = np.array([c.world_from_camera for c in seen.cameras])
+            kept = {"poses": poses, "focal": np.array([c.fx for c in seen.cameras]), "detail": seen.detail, "as_well": seen.as_well}
             stage.save("cameras", **kept)
     cameras = [replace(c, fx=f, fy=f, world_from_camera=p) for c, f, p in zip(cameras, kept["focal"], kept["poses"], strict=True)]
     place_cameras(bank, cameras)
     return cameras
 
 
-def say_borne_out(detail: np.ndarray, names: list[str], run) -> None:
-    """Say how many photos show what the others show at the same places. detail: (P,), see `fine_detail.borne_out`."""
+def say_borne_out(detail: np.ndarray, as_well: np.ndarray, names: list[str], run) -> None:
+    """Say how many photos show what the others show at the same places, and whose places are told by nothing. detail, as_well: (P,), see
+    `SecondLook`."""
     low = np.flatnonzero(detail < BORNE_OUT)
     run.say(
         f"fine detail: {len(detail) - len(low)} of {len(detail)} photos show what the others show at the same places "
@@ -197,6 +200,16 @@ def say_borne_out(detail: np.ndarray, names: list[str], run) -> None:
         )
     elif len(low):
         run.say(f"note: not borne out by the others in fine detail: {', '.join(names[i] for i in low[np.argsort(detail[low])][:5])}")
+    unsure = np.flatnonzero(as_well)
+    if len(unsure):
+        turn = f"{len(unsure)} of {len(detail)} photos fit about as well elsewhere, turned by {np.median(as_well[unsure]):.0f} degrees"
+        if len(unsure) > ALIKE * len(detail):
+            run.say(
+                f"note: {turn}: the object is alike from several sides, and the poses hold up to such turns only: "
+                "colours of one side may stand on another; answer `relit quadrants PHOTOS`"
+            )
+        else:
+            run.say(f"note: {turn}: {', '.join(names[i] for i in unsure[:5])}")
 
 
 def hull_of(cameras: list[Camera], masks: list[np.ndarray], nodes: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -111,14 +111,25 @@ def told_by_others(new, found: list[Camera], shots, cameras, mesh, model: Volume
         return found
     surface = surface_of(mesh)
     laid = np.array([laid_on(surface, c, detail_of(s.rgb, s.mask)) for c, s in zip(cameras, shots, strict=True)])
-    told = told_apart(surface, [detail_of(s.rgb, s.mask) for s in new], found, places, laid)
+    told = told_apart(surface, [detail_of(s.rgb, s.mask) for s in new], found, places, laid).moved
     return [told.get(i, c) for i, c in enumerate(found)]
 
 
+@dataclass(frozen=True)
+class SecondLook:
+    """cameras: of all photos. moved: numbers of the photos that moved. detail: (P,), see `borne_out`. as_well: (P,) degrees by which
+    another place, from which a photo shows about as much of what the others show, is turned against its own; 0 where there is none."""
+
+    cameras: list[Camera]
+    moved: list[int]
+    detail: np.ndarray
+    as_well: np.ndarray
+
+
 def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, degrees: float, still, options: CollectionOptions, seed: int):
-    """(cameras, numbers of the photos that moved, (P,) `borne_out`): every photo is searched for in the finished model, whose detail tells
-    apart what the coarse ones took for each other. Photos that fit elsewhere by GAIN move there, and so do those that from elsewhere show
-    more of what the others show there (a stool from above, half a turn away: fit/fine_detail.py). still: (P,) bool, photos that stay."""
+    """A SecondLook: every photo is searched for in the finished model, whose detail tells apart what the coarse ones took for each other.
+    Photos that fit elsewhere by GAIN move there, and so do those that from elsewhere show more of what the others show there (a
+    stool from above, half a turn away: fit/fine_detail.py). still: (P,) bool, photos that stay."""
     places = other_places(shots, cameras, model, degrees, still, options, seed)
     out, moved = list(cameras), {}
     for i, camera, gain in places:  # the best comes first
@@ -126,10 +137,12 @@ def look_again(shots: list[Shot], cameras: list[Camera], model: VolumeModel, deg
             out[i] = moved[i] = camera
     surface = surface_of(extract_mesh(dense_values(model.grid), faces=options.faces))
     pictures = [detail_of(s.rgb, s.mask) for s in shots]
-    far = far_from(out, places)
-    told = told_apart(surface, pictures, out, far) if far else {}
-    out = [told.get(i, c) for i, c in enumerate(out)]
-    return out, sorted(moved | told), borne_out(surface, pictures, out)
+    told = told_apart(surface, pictures, out, far_from(out, places))
+    out = [told.moved.get(i, c) for i, c in enumerate(out)]
+    turns = np.zeros(len(out))
+    for i, camera in told.as_well.items():
+        turns[i] = turn_between(out[i].world_from_camera, camera.world_from_camera)
+    return SecondLook(out, sorted(moved | told.moved), borne_out(surface, pictures, out), turns)
 
 
 def other_places(shots, cameras: list[Camera], model: VolumeModel, degrees: float, still, options: CollectionOptions, seed: int):

@@ -28,6 +28,7 @@ FACING = 0.3  # least cosine between normal and ray
 LEAST_PHOTOS = 4  # that must see a place for it to count
 LEAST_POINTS = 100  # that a photo must see
 GAIN = 0.1  # of the correlation, by which another pose must be better: right ones gained .15 to .37, wrong ones lost .05 and more
+AS_WELL = 0.05  # of the correlation, by which another pose may be worse and still do as well
 ROUNDS = 3  # each photo that comes right makes clearer what the others should show
 
 
@@ -117,31 +118,44 @@ def likeness(surface: Surface, camera: Camera, picture: Picture, shown: np.ndarr
     return max(at_shift(best[1] + i, best[2] + j) for i in (-1, 0, 1) for j in (-1, 0, 1))[0]
 
 
+@dataclass(frozen=True)
+class Told:
+    """moved: photos (by number) that show more of what the others show from another camera than their own, and that camera. as_well: photos
+    that show about as much of it from another camera, and that one."""
+
+    moved: dict[int, Camera]
+    as_well: dict[int, Camera]
+
+
 def told_apart(
     surface: Surface, pictures: Sequence[Picture], cameras: Sequence[Camera], choices: Sequence[tuple[int, Camera]], laid=None
-) -> dict[int, Camera]:
-    """The photos (by number) that show more of what the others show from another camera than their own: {photo: that camera}.
+) -> Told:
+    """What fine detail says of the places that photos may have been taken from.
 
     choices: (photo, another camera it may have been). laid: (P, N) what photos with known cameras show, against which these
     are held, or None: they are held against each other, a photo that has moved from its new place.
     """
-    now, moved = list(cameras), {}
+    now, moved, as_well = list(cameras), {}, {}
     for _ in range(ROUNDS if laid is None else 1):
         shows = laid
         if laid is None:
             shows = np.array([laid_on(surface, c, p) for c, p in zip(now, pictures, strict=True)])
-        better: dict[int, tuple[float, Camera]] = {}
+        better: dict[int, Camera] = {}
+        as_well = {}
         for i in sorted({i for i, _ in choices}):
             shown = expected(shows if laid is not None else np.delete(shows, i, 0))
-            least = likeness(surface, now[i], pictures[i], shown) + GAIN
+            own = likeness(surface, now[i], pictures[i], shown)
             found = [(likeness(surface, c, pictures[i], shown), k) for k, (j, c) in enumerate(choices) if j == i and c is not now[i]]
-            if found and max(found)[0] > least:
-                better[i] = (max(found)[0], choices[max(found)[1]][1])
+            height, best = max(found, default=(-1.0, -1))
+            if height > own + GAIN:
+                better[i] = choices[best][1]
+            elif own > -1 and height > own - AS_WELL:
+                as_well[i] = choices[best][1]
+        now = [better.get(i, c) for i, c in enumerate(now)]
+        moved |= better
         if not better:
             break
-        for i, (_, camera) in better.items():
-            now[i] = moved[i] = camera
-    return moved
+    return Told(moved, as_well)
 
 
 def borne_out(surface: Surface, pictures: Sequence[Picture], cameras: Sequence[Camera]) -> np.ndarray:
