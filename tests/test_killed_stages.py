@@ -59,7 +59,7 @@ TOLD = """
 import os
 if "TRUE_POSES" in os.environ:
     import numpy, relit.fit.duplicates_poses as poses
-    poses.place = lambda views, *_, **__: (numpy.load(os.environ["TRUE_POSES"]), numpy.full(len(views), 0.95))
+    poses.place_few = lambda views, *_, **__: (numpy.load(os.environ["TRUE_POSES"]), numpy.full(len(views), 0.95))
     poses.ambiguous = lambda views, *_, **__: numpy.zeros(len(views))
 """
 

@@ -61,7 +61,7 @@ def true_poses(pile, number=0):
 
 def stand_in(monkeypatch, poses, unsure=0.0):
     """Let the search of the poses return these, the first of them being ambiguous by `unsure` degrees."""
-    monkeypatch.setattr(poses_stage, "place", lambda views, search, **_: (poses, np.full(len(views), 0.95)))
+    monkeypatch.setattr(poses_stage, "place_few", lambda views, search, **_: (poses, np.full(len(views), 0.95)))
     monkeypatch.setattr(poses_stage, "ambiguous", lambda views, *_, **__: np.array([unsure] + [0.0] * (len(views) - 1)))
 
 

@@ -15,7 +15,8 @@ from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instance_growth import seen_from
-from relit.fit.instance_search import Search, ambiguous, place
+from relit.fit.instance_search import Search, ambiguous
+from relit.fit.instance_trials import place_few
 from relit.fit.instances import COARSE, View, carved, views_of
 from relit.run import run_arrays
 from relit.scene import Camera, Pixels
@@ -47,7 +48,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
         matched = None if "matching" in options.without else match_instances(shots, run, options, seed)
         search = Search(rounds=options.search_rounds, **({"descents": 0} if "refinement" in options.without else {}))
         try:
-            poses, scores = place(views, search, seed=seed, links=matched.told if matched else (), say=run.say)
+            poses, scores = place_few(views, search, seed=seed, links=matched.told if matched else (), say=run.say)
         except ValueError:
             raise UserError(
                 "no poses of the instances fit together",

@@ -214,10 +214,7 @@ def ambiguous(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0)
     none: it agrees with the model of all so well that what the own one falls short of 1 grows by less than the share UNSURE."""
     parts, crops = DETAILED, crops_of(views)
     rings = crop_rings(crops, parts)
-    values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
-    model, _ = fit_model(views, poses, values, 2 * o.steps, seed=seed)
-    render = albedo_render(model)
-    _, own = refine(crops, poses, render, rings=rings, steps=(0, 2.0), parts=parts)
+    render, own = model_of_all(views, poses, o, seed=seed)
     far = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
     gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed), far), parts)
     found = look_for(views, crops, gallery, rings, parts, keep=3, apart=APART)
@@ -228,6 +225,15 @@ def ambiguous(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0)
         better = (away >= APART) & (score > best)
         best, angle = np.where(better, score, best), np.where(better, away, angle)
     return angle
+
+
+def model_of_all(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0):
+    """What renders a model that is fitted to all views, and the scores (N,) of all against it."""
+    crops = crops_of(views)
+    values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
+    model, _ = fit_model(views, poses, values, 2 * o.steps, seed=seed)
+    render = albedo_render(model)
+    return render, refine(crops, poses, render, rings=crop_rings(crops, DETAILED), steps=(0, 2.0), parts=DETAILED)[1]
 
 
 def trusted(scores: np.ndarray, gap: float = GAP) -> np.ndarray:
