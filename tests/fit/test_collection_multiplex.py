@@ -1,6 +1,7 @@
 """SAMURAI's soft assignment: shares, their memory, and what takes part in a fit."""
 
 import numpy as np
+import pytest
 
 from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
@@ -57,7 +58,8 @@ def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_search
     from relit.fit.collection_options import CollectionOptions
 
     kept = []
-    shots = [SimpleNamespace(direction=np.zeros(3))]
+    camera = SimpleNamespace(with_pose=lambda pose: SimpleNamespace(world_from_camera=pose), world_from_camera=np.eye(4))
+    shots = [SimpleNamespace(direction=np.zeros(3), camera=camera)]
     quiet = SimpleNamespace(say=lambda *_: None)
     nothing = {"crops_of": [None], "crop_rings": None, "volume_render": None, "make_gallery": None}
 
@@ -71,6 +73,18 @@ def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_search
         kept.append(keep)
         return np.eye(4)[None], np.ones(1)
 
+    def refined(crops, found, render, rings, keep):
+        kept.append(keep)
+        return np.eye(4)[None], np.ones(1)
+
+    class SearchedAgain(Exception):
+        pass
+
+    def refine(*_, **__):
+        raise SearchedAgain
+
+    monkeypatch.setattr(collection_held_out, "best_refined", refined)
+    monkeypatch.setattr(collection_held_out, "refine", refine)
     for name, value in nothing.items():
         monkeypatch.setattr(collection_held_out, name, lambda *_, value=value: value)
     for name in ("hint_prior", "near", "views_from"):
@@ -81,8 +95,12 @@ def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_search
     monkeypatch.setattr(collection, "crops_of", lambda _: [None])
     monkeypatch.setattr(collection, "poses_from_links", links)
     monkeypatch.setattr(collection, "find_poses", poses)
-    for options, expected in ((CollectionOptions(keep=4), 4), (CollectionOptions(keep=4, without=("multiplex",)), 1)):
+    many, one = CollectionOptions(keep=4), CollectionOptions(keep=4, without=("multiplex",))
+    for options, expected, elsewhere in ((many, 4, collection_held_out.CHOICES), (one, 1, 1)):
         kept.clear()
-        collection_held_out.find(shots, None, 45.0, options, 0)
+        collection_held_out.register(shots, None, 45.0, options, 0)
         collection.find_all(shots, [], 45.0, quiet, options, 0)
-        assert kept == [expected] * 3
+        assert kept == [expected] * 4
+        with pytest.raises(SearchedAgain):
+            collection_held_out.other_places(shots, [camera], None, 45.0, np.zeros(1, bool), options, 0)
+        assert kept[4:] == [elsewhere]
