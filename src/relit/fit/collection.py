@@ -196,10 +196,11 @@ def say_borne_out(detail: np.ndarray, as_well: np.ndarray, names: list[str], run
     )
     if len(low) > 0.5 * len(detail):
         run.say(
-            "note: most photos are not borne out by the others in fine detail: they are in wrong places, or too far apart, "
+            "note: most photos are not borne out by the others in fine detail: they are in wrong places, too far apart, of different objects, "
             "or the object is plain or mirrors its surroundings: look at the result; photos between these and masks help"
         )
-    elif len(low):
+        return  # what fits as well elsewhere then says nothing of the object
+    if len(low):
         run.say(f"note: not borne out by the others in fine detail: {', '.join(names[i] for i in low[np.argsort(detail[low])][:5])}")
     unsure = np.flatnonzero(as_well)
     if len(unsure):
