@@ -196,8 +196,8 @@ def say_borne_out(detail: np.ndarray, as_well: np.ndarray, names: list[str], run
     )
     if len(low) > 0.5 * len(detail):
         run.say(
-            "note: most photos are not borne out by the others in fine detail: they are in wrong places, too far apart, of different objects, "
-            "or the object is plain or mirrors its surroundings: look at the result; photos between these and masks help"
+            "note: most photos are not borne out by the others in fine detail: they are in wrong places, too far apart, of different "
+            "objects, or the object is plain or mirrors its surroundings: look at the result; photos between these and masks help"
         )
         return  # what fits as well elsewhere then says nothing of the object
     if len(low):
