@@ -66,8 +66,8 @@ def test_where_none_agree_the_best_is_taken_and_said(search):
 
 
 def test_a_search_that_fails_is_no_end(search):
-    got, _, seeds = search([ValueError("nothing"), poses(1), ValueError("nothing")], [0.95])
-    assert np.array_equal(got, poses(1)) and len(seeds) == 3
+    got, said, seeds = search([ValueError("nothing"), poses(1), ValueError("nothing")], [0.95])
+    assert np.array_equal(got, poses(1)) and len(seeds) == 3 and "no two of 3 searches" in said[-1]
     with pytest.raises(ValueError, match="nothing"):
         search([ValueError("nothing")] * 3, [])
 

@@ -53,8 +53,9 @@ LIGHT = "one light per photo (collection)"
 DIFFUSION = 0.1  # of the volume pass: with quiet masks it needs less smoothing
 EXCHANGE = 14.0  # most of exchange_rate times steps: the lights are flatter than true ones, and highlights then ask for ever more of them
 BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to be in its place
-ALIKE = 0.15  # share of photos that fit as well elsewhere from which on the object is called alike from several sides: the stool of the
-# suite `collection` has .02 with quadrants and .32 without
+# share of photos that fit as well elsewhere from which on the object is called alike from several sides: the stool of the suite
+# `collection` has .02 with quadrants and .32 without
+ALIKE = 0.15
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("links", "poses", "volume", "second_look", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True

@@ -37,12 +37,10 @@ def place_few(views: list[View], o: Search, *, seed: int = 0, links=(), say=lamb
         say(f"search {trial + 1} of at most {TRIALS}: agreement of all with a model of all {agreement:.3f}")
         if like:
             say("two searches have come to the same poses")
-            found = [*like, found[-1]]
-            break
-    best = max(found, key=lambda one: one[0])
-    if len(found) == TRIALS:
-        say(f"note: no two of {TRIALS} searches come to the same poses: the best is taken (agreement {best[0]:.3f}); look at the result")
-    return best[1], best[2]
+            return max([*like, found[-1]], key=lambda one: one[0])[1:]
+    agreement, poses, scores = max(found, key=lambda one: one[0])
+    say(f"note: no two of {TRIALS} searches come to the same poses: the best is taken (agreement {agreement:.3f}); look at the result")
+    return poses, scores
 
 
 def turned_apart(a: np.ndarray, b: np.ndarray) -> float:
