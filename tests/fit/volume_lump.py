@@ -34,14 +34,15 @@ def volume_lump():
     return model
 
 
-def photos_of(model, count, rng):
-    """Photos from anywhere, off the middle, any turn, any exposure and white: (rgb, mask, camera), with the true pose in the camera."""
+def photos_of(model, count, rng, turn=np.pi):
+    """Photos from anywhere, off the middle, turned by up to `turn` radians, any exposure and white: (rgb, mask, camera), with the true
+    pose in the camera."""
     from relit.fit.register import volume_render
 
     out = []
     for _ in range(count):
         d = rng.normal(size=3)
-        pose = look_at(d / np.linalg.norm(d) * 3.5, roll=rng.uniform(-np.pi, np.pi))
+        pose = look_at(d / np.linalg.norm(d) * 3.5, roll=rng.uniform(-turn, turn))
         pose[:3, :3] = pose[:3, :3] @ exp_so3(rng.uniform(-0.15, 0.15, 3))
         camera = Camera(120, 120, 150.0, 150.0, 60.0, 60.0, pose)
         rgb, alpha = (a[0] for a in volume_render(model)([camera]))

@@ -24,6 +24,8 @@ import numpy as np
 from relit.cameras.links import Group
 from relit.conventions import similarity
 from relit.errors import UserError
+from relit.fit.collection_depth import depth_limit
+from relit.fit.collection_few import FEW
 from relit.fit.collection_growth import find_poses
 from relit.fit.collection_held_out import held_out_stage, look_again
 from relit.fit.collection_links import links_stage, poses_from_links, with_focals
@@ -36,7 +38,7 @@ from relit.fit.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, restore_model, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.hull import visual_hull
+from relit.geometry.hull import distance_of, visual_hull
 from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.per_photo import COLUMNS, ROWS
@@ -151,6 +153,9 @@ def volume_stage(shots, cameras, weights, linked, tints, run, options: Collectio
     if "coarse_to_fine" in options.without:
         levels, steps, masks = levels[-1:], (sum(steps),), masks[-1:]
     values = hull_of(cameras, silhouettes, levels[0])
+    limit = depth_limit(crops_of(shots), np.array([c.world_from_camera for c in cameras]), levels[0]) if len(shots) < FEW else None
+    if limit is not None and (limit & (values < 0)).any():
+        values = distance_of(limit & (values < 0))
     model = start_model(values, np.full(3, GREY), None, full=False)
     model.reflections, model.rates = start_photo_lights(tints, GREY)
     model.appearance = shade_photos

@@ -13,7 +13,9 @@ import numpy as np
 
 from relit.cameras.se3 import rotation_from
 from relit.conventions import similarity
-from relit.fit.collection_pairs import agreeing, inflated, pairs_of, placed_towards
+from relit.fit.collection_depth import ONE_SIDE, depth_limit, inflated
+from relit.fit.collection_few import FEW, best_way, few_from_hints
+from relit.fit.collection_pairs import agreeing, pairs_of, placed_towards
 from relit.fit.collection_poses import (
     HOPELESS,
     Schedule,
@@ -46,9 +48,9 @@ PARTS = (0.6, 1.0, 0.15, 0.3)  # of register.PARTS: without hints decoration tel
 FEWEST = 6  # photos of a set that growth begins from
 FASTER = 1.3  # by which the set grows each round
 AROUND = 40.0  # degrees from viewpoints of the set within which others are trusted
-ONE_SIDE = 75.0  # degrees between viewpoints below which silhouettes leave the depth open
 ROLL = 30.0  # degrees by which photos may be out of upright, where those of the set are upright
 UPRIGHT = 0.03  # weight of that in the search: photos that were turned all the way cost four times as much
+ABOVE = 20.0  # degrees from which objects are photographed from above, most of the time
 LEVELLED = 0.3  # mean of the photos' upward directions below which they have none in common
 
 
@@ -76,17 +78,6 @@ def upright_prior(gallery: Gallery) -> np.ndarray:
     seen = np.array([c.centre / np.linalg.norm(c.centre) for c in gallery.cameras])
     turn = np.degrees(turn_angles(np.arange(TURNS))) / ROLL
     return -UPRIGHT * (1 - seen[:, 1] ** 2)[:, None] * np.minimum(turn**2, 4)
-
-
-def depth_limit(crops: list[Crop], poses: np.ndarray, nodes: int) -> np.ndarray | None:
-    """(n, n, n) bool: where the object may be, told by the photo in the middle of the others, while all look from one side: then their
-    silhouettes leave its depth open. None where they go around it."""
-    centres = poses[:, :3, 3] / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
-    middle = int((centres @ centres.mean(0)).argmax())
-    spread = np.degrees(np.arccos(np.clip((centres @ centres[middle]).min(), -1, 1)))
-    if spread >= ONE_SIDE:
-        return None
-    return inflated(crops[middle], crop_views([crops[middle]], poses[middle][None])[0], nodes, 1 + spread / 40)
 
 
 def grow_set(
@@ -124,10 +115,12 @@ def grow_set(
     return poses, scores
 
 
-def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=None, nodes: int = 40):
-    """Poses (P, 4, 4) and scores (P,) from one photo on: round i registers all photos and keeps the sizes[i] best for the next model."""
+def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=None, nodes: int = 40, above: float | None = None):
+    """Poses (P, 4, 4) and scores (P,) from one photo on: round i registers all photos and keeps the sizes[i] best for the next model.
+    above: degrees from which the first photo is taken to look down; all are then taken to be upright. None: nothing is known of either."""
     rings = crop_rings(crops, PARTS) if rings is None else rings
-    poses = np.array([pose_towards(c, np.array([0.0, 0.0, 1.0])) for c in crops])
+    height = np.radians(above or 0.0)
+    poses = np.array([pose_towards(c, np.array([0.0, np.sin(height), np.cos(height)])) for c in crops])
     used, scores = [first], np.zeros(len(crops))
     anchor = poses[first]
     for i, size in enumerate(sizes):
@@ -141,7 +134,8 @@ def grow(crops: list[Crop], first: int, sizes: list[int], seed: int, say, rings=
         render = volume_render(model)
         gallery = make_gallery(render, views_from(directions_around(400, seed + i)), PARTS)
         seen = near(gallery, centres, 55).any(0)
-        found = search(crops, gallery, 1, rings=rings, allowed=np.tile(seen, (len(crops), 1)))
+        prior = None if above is None else np.broadcast_to(upright_prior(gallery), (len(crops), len(gallery.cameras), TURNS))
+        found = search(crops, gallery, 1, rings=rings, allowed=np.tile(seen, (len(crops), 1)), prior=prior)
         poses, scores = found.poses[:, 0], found.scores[:, 0]
         if i >= 4:
             poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 4.0, 2.0), parts=PARTS)
@@ -170,6 +164,7 @@ def find_poses(
     without: names of `collection.WITHOUT`. linked: (poses, scores, held) of `collection_links.poses_from_links`, which then come first.
     soft: see `poses_from_hints`."""
     hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
+    few = len(crops) < FEW and cycles > 0 and linked is None
     if "search" in without:
         front = np.array([0.0, 0.0, 1.0])
         poses = [pose_towards(c, d if d.any() else front) for c, d in zip(crops, directions, strict=True)]
@@ -178,6 +173,11 @@ def find_poses(
     def tell(text, *_):
         say(text)
 
+    if few and hinted == 1:
+        return few_from_hints(crops, directions, degrees, schedule, keep, seed, tell, cycles, soft if keep > 1 else None)
+    if few and hinted < 0.5:
+        poses, scores = few_by_growth(crops, starts, keep, seed, tell, cycles)
+        return upright(poses), scores
     held = None
     if linked is not None:
         poses, scores, held = linked
@@ -213,6 +213,20 @@ def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
     return settle(crops, poses, scores, rings, keep, seed, say)
 
 
+def few_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say, cycles: int):
+    """Poses (P, 4, 4) and scores (P,) of few photos: grown to the end from each of `starts` photos, and the best way taken."""
+    rings, count, none = crop_rings(crops, PARTS), len(crops), np.zeros((len(crops), 3))
+    sizes = [min(count, size) for size in (2, 3, 4, 5, 6, 8, 10, 13, 17)]
+    sizes = [*sizes[: sizes.index(count) + 1], count, count] if count in sizes else [*sizes, count, count]
+
+    def grown_from(photo: int):
+        poses, _ = settle(crops, *grow(crops, photo, sizes, seed, say, rings, above=ABOVE), rings, keep, seed, say, limited=True)
+        return polish(crops, poses, none, 45.0, keep, seed, say, cycles, limited=True)
+
+    ways = {f"grown from photo {k}": lambda k=k: grown_from(k) for k in start_photos(crops, rings, starts)}
+    return best_way(crops, ways, seed, say)
+
+
 def start_photos(crops: list[Crop], rings, count: int) -> list[int]:
     """Photos to start from: seen large and unlike each other, by the descriptors' own distances."""
     from relit.fit.register import all_scores
@@ -226,12 +240,13 @@ def start_photos(crops: list[Crop], rings, count: int) -> list[int]:
     return chosen
 
 
-def settle(crops: list[Crop], poses: np.ndarray, scores: np.ndarray, rings, keep: int, seed: int, say, rounds: int = 3):
+def settle(crops: list[Crop], poses: np.ndarray, scores: np.ndarray, rings, keep: int, seed: int, say, rounds: int = 3, limited=False):
     """A few rounds with all photos and no restriction on the viewpoints; the best on average counts, be it the beginning: a handful of
-    photos is worse off without restriction."""
+    photos is worse off without restriction. limited: see `depth_limit`."""
     best = (float(scores.mean()), poses, scores)
     for i in range(rounds):
-        model = coarse_model(crops, gauge(crops, poses), 48, 120, 0.12, seed + 100 + i)
+        limit = depth_limit(crops, gauge(crops, poses), 48) if limited else None
+        model = coarse_model(crops, gauge(crops, poses), 48, 120, 0.12, seed + 100 + i, limit)
         render = volume_render(model)
         gallery = make_gallery(render, views_from(directions_around(500, seed + 100 + i)), PARTS)
         found = search(crops, gallery, keep, rings=rings)

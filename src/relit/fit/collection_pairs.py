@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from relit.cameras.se3 import nearest_rotation
 from relit.conventions import similarity
+from relit.fit.collection_depth import inflated
 from relit.fit.collection_poses import coarse_model, distance_for, pose_towards
 from relit.fit.register import AHEAD, Crop, crop_views, directions_around, make_gallery, search, views_from, volume_render
-from relit.geometry.sdf import node_positions
-from relit.scene import Camera
 
 FRONT = np.array([0.0, 0.0, 1.0])  # where the one photo of a rough solid looks from
 REACH = 57.0  # degrees from there up to which the solid is looked at
@@ -36,19 +34,6 @@ class Pair:
     first: int
     second: int
     rotation: np.ndarray
-
-
-def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarray:
-    """(n, n, n) bool: where the object may be when one photo was seen from `camera`: as thick as its outline is far."""
-    p = node_positions(nodes).reshape(-1, 3)
-    to_outline = distance_transform_edt(crop.mask > 0.5) * (np.linalg.norm(camera.centre) / camera.fx)
-    q = camera.project(p)
-    u, v = np.floor(q[:, 0]).astype(int), np.floor(q[:, 1]).astype(int)
-    ok = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    limit = np.zeros(len(p))
-    limit[ok] = np.minimum(to_outline[v[ok], u[ok]] * 1.4, 0.6)
-    depth = np.abs(p @ camera.world_from_camera[:3, 2])
-    return (depth < limit * loosen + 0.03).reshape(nodes, nodes, nodes)
 
 
 def angles(rotations: np.ndarray) -> np.ndarray:

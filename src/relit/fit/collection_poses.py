@@ -17,6 +17,7 @@ import numpy as np
 
 from relit.cameras.se3 import look_at, rotation_angle
 from relit.conventions import similarity
+from relit.fit.collection_depth import depth_limit
 from relit.fit.collection_framing import crop_bank, is_cut, not_empty
 from relit.fit.collection_multiplex import expanded, updated, with_refined
 from relit.fit.loop import NoStage
@@ -129,10 +130,12 @@ def coarse_model(crops: list[Crop], poses, nodes: int, steps: int, tolerance: fl
     return fit_volume(bank, model, options, NoStage(), seed)
 
 
-def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep=3, soft=None):
+def poses_from_hints(
+    crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, seed: int, say, keep=3, soft=None, limited=False
+):
     """Poses (P, 4, 4) and scores (P,) when each photo's direction is known to within `degrees`. directions: (P, 3) unit, zeros where a
     photo has none: such photos are registered from the second round on, wherever they fit. soft: sharpness of a soft assignment, or
-    None: then only the best hypothesis of a photo takes part in the fits (see collection_multiplex.py)."""
+    None: then only the best hypothesis of a photo takes part in the fits (see collection_multiplex.py). limited: see `depth_limit`."""
     rings = crop_rings(crops, PARTS)
     hinted = np.linalg.norm(directions, axis=1) > 0.5
     poses = np.array([pose_towards(c, d if h else [0, 0, 1.0]) for c, d, h in zip(crops, directions, hinted, strict=True)])
@@ -143,7 +146,8 @@ def poses_from_hints(crops: list[Crop], directions: np.ndarray, degrees: float, 
         if multiplex is not None and len(used) == len(crops):
             some, own, shares = expanded(crops, multiplex)
             own = gauge(some, own)
-        model = coarse_model(some, own, schedule.nodes[i], schedule.steps[i], schedule.tolerance[i], seed + i, None, shares)
+        limit = depth_limit(some, own, schedule.nodes[i]) if limited else None
+        model = coarse_model(some, own, schedule.nodes[i], schedule.steps[i], schedule.tolerance[i], seed + i, limit, shares)
         render = volume_render(model)
         gallery = make_gallery(render, views_from(directions_around(schedule.views[i], seed + i)), PARTS)
         prior = HINT * (1 - i / rounds) * hint_prior(gallery, directions, degrees, 15.0) * hinted[:, None, None]
@@ -171,10 +175,10 @@ def best_refined(crops, found, render, rings, keep: int, steps=REFINE, parts=PAR
 
 
 def descended(
-    crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed: int, held=None, limit=None
+    crops: list[Crop], poses: np.ndarray, nodes: int, steps: int, seed: int, held=None, limit=None, stage=None
 ) -> tuple[VolumeModel, np.ndarray]:
     """A model (VolumeModel) with one small light per photo, fitted with the poses free, but for those of `held` photos (P,); and the poses.
-    Focal lengths stay. limit: as in `coarse_model`."""
+    Focal lengths stay. limit: as in `coarse_model`. stage: hears the losses, or None."""
     cameras = crop_views(crops, gauge(crops, poses))
     model = start_model(hull_by_vote(cameras, not_empty(crops), nodes, 0.12, limit), np.full(3, GREY), None, full=False)
     model.reflections, model.rates = start_photo_lights(np.full((len(crops), 3), GREY), GREY)
@@ -184,7 +188,7 @@ def descended(
     if held is not None:
         model.extra["correction_rates"] = mi.Float(np.repeat(1.0 - np.asarray(held, np.float32), 7))
     options = VolumeOptions((nodes,), (steps,), 4096, feature_rate=0.03, sharpness=(1.0, 3.0), step=0.8, refine_cameras=0.005)
-    fit_volume(bank, model, options, NoStage(), seed)
+    fit_volume(bank, model, options, stage or NoStage(), seed)
     numbers = np.array(bank.corrections).reshape(-1, 7)
     numbers[:, 6] = 0
     found = corrected(cameras, numbers.ravel())
@@ -192,15 +196,18 @@ def descended(
     return model, np.array(moved)
 
 
-def polish(crops: list[Crop], poses, directions: np.ndarray, degrees: float, keep: int, seed: int, say, cycles: int, held=None):
+def polish(
+    crops: list[Crop], poses, directions: np.ndarray, degrees: float, keep: int, seed: int, say, cycles: int, held=None, limited=False
+):
     """Descend, then search again in the sharper model: descent brings most photos to within a degree or two, the search the others.
-    held: (P,) bool, photos that only descend, or None."""
+    held: (P,) bool, photos that only descend, or None. limited: see `depth_limit`."""
     rings, scores = crop_rings(crops, PARTS), np.zeros(len(crops))
     held = np.zeros(len(crops), bool) if held is None else held
     still = np.array([is_cut(c) for c in crops]) | held  # a search by whole silhouettes tells nothing of cut ones
     hinted = np.linalg.norm(directions, axis=1) > 0.5
     for i in range(cycles):
-        model, poses = descended(crops, poses, 48, 200, seed + 200 + i, held)
+        limit = depth_limit(crops, gauge(crops, poses), 48) if limited else None
+        model, poses = descended(crops, poses, 48, 200, seed + 200 + i, held, limit)
         render = volume_render(replace(model, appearance=shade_plain))
         gallery = make_gallery(render, views_from(directions_around(500, seed + 200 + i)), PARTS)
         prior = 0.5 * HINT * hint_prior(gallery, directions, degrees, 45.0) * hinted[:, None, None]

@@ -1,0 +1,68 @@
+"""Where each of a few photos was taken from: several ways, and the one whose poses explain the photos best.
+
+What a search finds is worth what its model is worth, and a model of a few photos is worth little while their poses are wrong: the search
+then scatters photos whose hints were nearly right. With few photos descent comes first, from the hints themselves, and the search second,
+in the sharper model. Neither order is always the better one, so both are gone, and a fit with the poses free tells which: a score of the
+registration does not, as a model of wrong poses is vague and agrees with many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from relit.fit.collection_depth import depth_limit
+from relit.fit.collection_poses import Schedule, descended, gauge, polish, pose_towards, poses_from_hints
+from relit.fit.loop import NoStage
+from relit.fit.register import Crop
+
+FEW = 24  # photos below which the ways are held against each other
+NODES, STEPS = 48, 200  # of the fit that tells
+
+Way = Callable[[], tuple[np.ndarray, np.ndarray]]
+
+
+def misfit(crops: list[Crop], poses: np.ndarray, seed: int) -> float:
+    """How badly one shape with one light per photo explains the photos, from these poses (P, 4, 4) on: the geometric mean of the volume
+    pass's colour and mask losses, so that neither counts for its scale."""
+    heard = NoStage()
+    descended(crops, poses, NODES, STEPS, seed, None, depth_limit(crops, gauge(crops, poses), NODES), heard)
+    return float(np.sqrt(heard.mean_loss("colour") * heard.mean_loss("mask")))
+
+
+def best_way(crops: list[Crop], ways: dict[str, Way], seed: int, say) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (P, 4, 4) and scores (P,) of the way with the least misfit. Ways that raise ValueError are passed over; raises ValueError when
+    all do."""
+    best, least, failed = None, np.inf, None
+    for name, way in ways.items():
+        try:
+            poses, scores = way()
+            wrong = misfit(crops, poses, seed)
+        except ValueError as error:
+            say(f"{name}: {error}")
+            failed = error
+            continue
+        say(f"{name}: mean score {scores.mean():.3f}, misfit {wrong:.4f}")
+        if best is None or wrong < least:
+            best, least = (poses, scores), wrong
+    if best is None:
+        raise failed or ValueError("there is no way")
+    return best
+
+
+def few_from_hints(
+    crops: list[Crop], directions: np.ndarray, degrees: float, schedule: Schedule, keep: int, seed: int, say, cycles: int, soft=None
+):
+    """As `collection_poses.poses_from_hints` with `polish` after it, for few photos, all of which have hints."""
+
+    def polished(poses):
+        return polish(crops, poses, directions, degrees, keep, seed, say, cycles, limited=True)
+
+    def descent_first():
+        return polished(gauge(crops, np.array([pose_towards(c, d) for c, d in zip(crops, directions, strict=True)])))
+
+    def search_first():
+        return polished(poses_from_hints(crops, directions, degrees, schedule, seed, say, keep, soft, limited=True)[0])
+
+    return best_way(crops, {"descent first": descent_first, "search first": search_first}, seed, say)
