@@ -79,6 +79,7 @@ def test_few_photos_end_nearer_than_their_hints(photos, crops):
     [
         (6, 6, False, 1, "hints"),
         (6, 0, False, 1, "growth"),
+        (12, 0, False, 1, ""),
         (6, 4, False, 1, ""),
         (6, 6, True, 1, ""),
         (6, 6, False, 0, ""),

@@ -147,3 +147,24 @@ def test_a_cut_photo_is_found_with_place_and_scale_free():
     assert found.view[0, 0] == 3 and found.scores[0, 0] > 0.8
     assert rotation_angle(found.poses[0, 0][:3, :3].T @ truth[:3, :3]) < 12
     assert np.linalg.norm(found.poses[0, 0][:3, 3] - truth[:3, 3]) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("photos", "linked", "begins"), [(6, 6, True), (6, 4, False), (4, 4, True), (4, 3, False), (60, 8, True), (60, 7, False)]
+)
+def test_from_how_many_linked_photos_a_shape_begins(monkeypatch, photos, linked, begins):
+    """Eight are enough; of few photos nearly all have to be linked."""
+    from relit.cameras.links import Group
+    from relit.errors import UserError
+    from relit.fit import collection_links as links
+
+    asked = []
+
+    def placed(*_):
+        asked.append(True)
+        raise UserError("far enough")
+
+    monkeypatch.setattr(links, "placed", placed)
+    group = Group(np.arange(linked), np.tile(np.eye(4), (linked, 1, 1)), np.ones(linked), np.zeros((0, 3)), np.zeros(0, int))
+    assert links.poses_from_links([None] * photos, [group], [], np.zeros((photos, 3)), 45.0, 1, 0, lambda *_: None) is None
+    assert bool(asked) == begins

@@ -164,7 +164,7 @@ def find_poses(
     without: names of `collection.WITHOUT`. linked: (poses, scores, held) of `collection_links.poses_from_links`, which then come first.
     soft: see `poses_from_hints`."""
     hinted = (np.linalg.norm(directions, axis=1) > 0.5).mean()
-    few = len(crops) < FEW and cycles > 0 and linked is None
+    few = len(crops) < FEW and cycles > 0
     if "search" in without:
         front = np.array([0.0, 0.0, 1.0])
         poses = [pose_towards(c, d if d.any() else front) for c, d in zip(crops, directions, strict=True)]
@@ -173,9 +173,9 @@ def find_poses(
     def tell(text, *_):
         say(text)
 
-    if few and hinted == 1:
+    if few and linked is None and hinted == 1:
         return few_from_hints(crops, directions, degrees, schedule, keep, seed, tell, cycles, soft if keep > 1 else None)
-    if few and hinted < 0.5:
+    if few and linked is None and hinted < 0.5 and len(crops) < 2 * FEWEST:  # of more, pairs may hold enough together to begin with
         poses, scores = few_by_growth(crops, starts, keep, seed, tell, cycles)
         return upright(poses), scores
     held = None
@@ -186,7 +186,7 @@ def find_poses(
     else:
         poses, scores = poses_by_growth(crops, starts, keep, seed, tell)
     if cycles > 0:
-        poses, scores = polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held)
+        poses, scores = polish(crops, poses, directions, degrees, keep, seed, tell, cycles, held, limited=few)
     return (poses if hinted >= 0.5 else upright(poses)), scores
 
 

@@ -17,6 +17,8 @@ from relit.capture.sphere import View, find_sphere, up_direction
 from relit.conventions import similarity
 from relit.device import load_pycolmap
 from relit.errors import UserError
+from relit.fit.collection_depth import depth_limit
+from relit.fit.collection_few import FEW
 from relit.fit.collection_framing import is_cut, slide
 from relit.fit.collection_photos import Shot
 from relit.fit.collection_poses import COARSE, HINT, PARTS, SLACK, best_refined, coarse_model
@@ -36,6 +38,7 @@ from relit.fit.register import (
 from relit.run import run_arrays
 
 BEGINS = 8  # photos of a group from which on the shape begins with it
+NEARLY_ALL, FEWEST = 0.75, 4  # share of few photos, and how many, that do as well: six photos of a can are linked by its label
 FITS = 0.8  # mean score of its photos in a model of themselves, below which a group is not believed
 ALIKE = 20.0  # degrees within which two photos of a group agree on where it lies
 CONTRADICTED = 50.0  # degrees: median of the angles to the hints, above which a group is not believed
@@ -114,7 +117,7 @@ def poses_from_links(
 
     held: photos whose poses come from matches; no search moves them.
     """
-    if not groups or len(groups[0].photos) < BEGINS:
+    if not groups or len(groups[0].photos) < min(BEGINS, max(FEWEST, NEARLY_ALL * len(crops))):
         return None
     members = groups[0].photos
     try:
@@ -129,7 +132,7 @@ def poses_from_links(
     poses, scores, held = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count), np.zeros(count, bool)
     poses[members] = own
     some = [crops[i] for i in members]
-    model = coarse_model(some, own, 48, 150, 0.12, seed)
+    model = coarse_model(some, own, 48, 150, 0.12, seed, depth_limit(some, own, 48) if len(crops) < FEW else None)
     render = volume_render(model)
     _, scores[members] = refine(some, own, render, rings=crop_rings(some, PARTS), steps=(), parts=PARTS)
     mean = float(scores[members].mean())
