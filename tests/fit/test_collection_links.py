@@ -1,5 +1,7 @@
 """Matches between photos as evidence: pycolmap on rendered photos, groups in the object's frame, votes; and photos that the frame cuts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,12 +15,13 @@ def device():
     use_device("cpu")
 
 
-def texture_ball(direction, side=220):
-    """(rgb, mask, world_from_camera, focal): a ball with a fine pattern, seen from `direction` at distance 3."""
+def texture_ball(direction, side=220, field=1.1):
+    """(rgb, mask, world_from_camera, focal): a ball with a fine pattern, seen from `direction` at distance 3. field: focal
+    length over side."""
     from relit.cameras.se3 import look_at
 
     pose = look_at(np.asarray(direction) / np.linalg.norm(direction) * 3)
-    focal = side * 1.1
+    focal = side * field
     x, y = np.meshgrid((np.arange(side) + 0.5 - side / 2) / focal, (np.arange(side) + 0.5 - side / 2) / focal)
     d = np.stack([x, y, np.ones_like(x)], -1)
     d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
@@ -59,15 +62,15 @@ def test_photos_of_one_ball_are_linked_whatever_their_light(tmp_path):
     assert "of 9 photos are linked" in said[-1] and not (tmp_path / "links").exists()
 
 
-def shots_of(count):
+def shots_of(count, step=40.0, side=64, field=1.1):
     from relit.fit.collection_photos import Shot
     from relit.scene import Camera, Photo
 
     out, poses = [], []
-    for i, d in enumerate(arc(count, 40.0)):
-        rgb, mask, pose, f = texture_ball(d, 64)
-        camera = Camera(64, 64, f, f, 32, 32, np.eye(4))
-        out.append(Shot(Photo(f"{i}.png", None, 64, 64), rgb, mask, camera, np.zeros(3)))
+    for i, d in enumerate(arc(count, step)):
+        rgb, mask, pose, f = texture_ball(d, side, field)
+        camera = Camera(side, side, f, f, side / 2, side / 2, np.eye(4))
+        out.append(Shot(Photo(f"{i}.png", None, side, side), rgb, mask, camera, np.zeros(3)))
         poses.append(pose)
     return out, np.array(poses)
 
@@ -168,3 +171,32 @@ def test_from_how_many_linked_photos_a_shape_begins(monkeypatch, photos, linked,
     group = Group(np.arange(linked), np.tile(np.eye(4), (linked, 1, 1)), np.ones(linked), np.zeros((0, 3)), np.zeros(0, int))
     assert links.poses_from_links([None] * photos, [group], [], np.zeros((photos, 3)), 45.0, 1, 0, lambda *_: None) is None
     assert bool(asked) == begins
+
+
+def spoilt(shots, which):
+    """The shots, the mask of one of them far too large: it takes what stands beside the object along."""
+    mask = shots[which].mask.copy()
+    mask[:, :70] = 1
+    out = list(shots)
+    out[which] = replace(shots[which], mask=mask)
+    return out
+
+
+@pytest.mark.parametrize("bad", [None, 4])
+def test_one_bad_mask_does_not_unlink_few_photos(bad):
+    from relit.cameras.links import Group
+    from relit.cameras.se3 import camera_errors
+    from relit.fit.collection_links import poses_from_links
+    from relit.fit.collection_photos import crops_of
+
+    shots, poses = shots_of(6, 6.0, 120, 0.45)
+    shots = shots if bad is None else spoilt(shots, bad)
+    other, _ = turned(poses, np.random.default_rng(3))
+    group = Group(np.arange(6), other, np.full(6, 0.45), np.zeros((0, 3)), np.zeros(0, int))
+    said = []
+    found, scores, held = poses_from_links(crops_of(shots), [group], shots, np.zeros((6, 3)), 45.0, 1, 0, said.append)
+    assert held.all() and camera_errors(found, poses)[0].max() < 1
+    named = [line for line in said if "look at its mask" in line]
+    assert len(named) == (bad is not None)
+    if bad is not None:
+        assert f"without {bad}.png" in named[0] and scores.argmin() == bad

@@ -24,7 +24,7 @@ def photos(lump):
 
 def fitted(photos, **options):
     """The mesh that the volume pass makes of the photos."""
-    from relit.fit.collection import hull_of
+    from relit.fit.collection_shape import hull_of
     from relit.fit.loop import NoStage
     from relit.fit.pixels import make_bank
     from relit.fit.volume import VolumeOptions, fit_volume, start_model

@@ -3,9 +3,11 @@
     photos       decode, masks (given, or guessed by GrabCut from the middle), focal length from EXIF or a guess
     links        groups of photos whose features match                              cameras/links.py, fit/collection_links.py
     poses        coarse models and registration by rendering, in turns, from quadrants or one silhouette    fit/collection_poses.py
-    volume       signed distance field, one small light per photo, cameras and focal lengths free           fit/volume.py
+    volume       signed distance field, one small light per photo, cameras and focal lengths free           fit/collection_shape.py
     second_look  photos that were put in a wrong place are searched for in the finished shape, and told by fine detail
                                                                           fit/collection_held_out.py, fit/fine_detail.py
+    hollows      what no silhouette shows, the space under a seat: asked of every flat face                 fit/lids.py
+    opened       where there is such a space, the finer levels of the volume pass again, from the opened shape
     mesh         zero level set, decimated; texture atlas
     surface      metallic-roughness textures, one environment per photo                                     fit/collection_surface.py
     held_out     camera and light of photos that were set aside, with the model frozen
@@ -17,34 +19,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from relit.cameras.links import Group
 from relit.conventions import similarity
 from relit.errors import UserError
-from relit.fit.collection_depth import depth_limit
-from relit.fit.collection_few import FEW
 from relit.fit.collection_growth import find_poses
 from relit.fit.collection_held_out import held_out_stage, look_again
 from relit.fit.collection_links import links_stage, poses_from_links, with_focals
 from relit.fit.collection_options import CollectionOptions, options_for
 from relit.fit.collection_photos import LEAST_PHOTOS, Shot, crops_of, load_shots
 from relit.fit.collection_poses import GREY, agreement, schedule_of
+from relit.fit.collection_shape import opened_stage, volume_stage
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, posterior, start_collection_surface
-from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras
+from relit.fit.pixels import PixelBank, place_cameras
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
-from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, restore_model, start_model
+from relit.fit.volume import VolumeModel
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.hull import distance_of, visual_hull
 from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.per_photo import COLUMNS, ROWS
 from relit.materials.field import normal_map, pictures, start_material
 from relit.rendering.shade import features_at
-from relit.rendering.shade_photos import shade_photos, start_photo_lights
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
@@ -52,14 +49,14 @@ from relit.settings import check_levels
 
 __all__ = ["LEAST_PHOTOS", "CollectionOptions", "options_for", "reconstruct"]
 LIGHT = "one light per photo (collection)"
-DIFFUSION = 0.1  # of the volume pass: with quiet masks it needs less smoothing
 EXCHANGE = 14.0  # most of exchange_rate times steps: the lights are flatter than true ones, and highlights then ask for ever more of them
+SMOOTH_COLOUR = 0.05  # of SurfaceOptions: under many lights a photo's shade is not taken for paint, and smoothing blurs what is paint
 BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to be in its place
 # share of photos that fit as well elsewhere from which on the object is called alike from several sides: the stool of the suite
 # `collection` has .02 with quadrants and .32 without
 ALIKE = 0.15
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
-STAGES = ("links", "poses", "volume", "second_look", "mesh", "surface", "held_out")
+STAGES = ("links", "poses", "volume", "second_look", "hollows", "opened", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
 COST = {"draft": (150.0, 1.2e9), "standard": (300.0, 1.5e9), "high": (2500.0, 3.0e9)}
 
@@ -75,6 +72,7 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
     cameras, weights, held_fast = pose_stage(shots, groups, degrees, run, options, seed)
     bank, cameras, model = volume_stage(shots, cameras, weights, held_fast, tints, run, options, seed)
     cameras = second_look_stage(bank, shots, cameras, model, degrees, held_fast, run, options, seed)
+    cameras = opened_stage(bank, shots, cameras, model, tints, run, options, seed)
     parts = mesh_stage(model, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     maps = surface_stage(bank, mesh, parts["albedo"], tints, run, options, seed)
@@ -144,34 +142,6 @@ def judge_poses(scores: np.ndarray, share: float, shots: list[Shot], options: Co
         )
 
 
-def volume_stage(shots, cameras, weights, linked, tints, run, options: CollectionOptions, seed: int):
-    """(pixel bank with the final cameras, cameras, model). Poses that come from matches move at a third of the others' rate."""
-    silhouettes = [s.mask for s in shots]
-    bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], silhouettes), weights, seed)
-    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
-    levels, steps, masks = options.levels, options.level_steps, options.mask_weights
-    if "coarse_to_fine" in options.without:
-        levels, steps, masks = levels[-1:], (sum(steps),), masks[-1:]
-    values = hull_of(cameras, silhouettes, levels[0])
-    limit = depth_limit(crops_of(shots), np.array([c.world_from_camera for c in cameras]), levels[0]) if len(shots) < FEW else None
-    if limit is not None and (limit & (values < 0)).any():
-        values = distance_of(limit & (values < 0))
-    model = start_model(values, np.full(3, GREY), None, full=False)
-    model.reflections, model.rates = start_photo_lights(tints, GREY)
-    model.appearance = shade_photos
-    model.extra["correction_rates"] = mi.Float(np.repeat(np.where(linked, 0.3, 1.0), 7).astype(np.float32))
-    calm = {"mask": masks, "diffusion": DIFFUSION, "sharpness": (1.5, 6.0)}
-    o = VolumeOptions(levels, steps, options.rays, refine_cameras=options.refine_cameras, **calm)
-    if run.done("volume"):
-        restore_model(model, bank, run_arrays(run, "volume", "checkpoint"))
-    else:
-        with run.stage("volume", steps=sum(steps), title="shape and cameras (volume pass)") as stage:
-            fit_volume(bank, model, o, stage, seed)
-    cameras = corrected(cameras, np.array(bank.corrections))
-    place_cameras(bank, cameras)
-    return bank, cameras, model
-
-
 def second_look_stage(bank: PixelBank, shots, cameras, model: VolumeModel, degrees, linked, run, options: CollectionOptions, seed: int):
     """The cameras, those of lost photos found anew (`linked` ones are not lost); `bank` gets them too."""
     if "search" in options.without:
@@ -220,27 +190,6 @@ def say_borne_out(detail: np.ndarray, as_well: np.ndarray, names: list[str], run
             run.say(f"note: {turn}: {', '.join(names[i] for i in unsure[:5])}")
 
 
-def hull_of(cameras: list[Camera], masks: list[np.ndarray], nodes: int) -> np.ndarray:
-    """The visual hull by a vote that forgives poses that are a few degrees off."""
-    for tolerance in (0.1, 0.2, 0.35, 0.5):
-        try:
-            values = visual_hull(cameras, masks, nodes, tolerance=tolerance)
-        except ValueError:
-            continue
-        if (values < 0).sum() > 100:
-            return values
-    raise UserError("the silhouettes have nothing in common", "poses or masks are wrong", "look at the masks (relit inspect)", code=4)
-
-
-def weighted_bank(bank: PixelBank, weights: np.ndarray, seed: int) -> PixelBank:
-    """The bank, its batches drawn from photos in proportion to `weights`: posterior scaling as the chance to be looked at."""
-    candidates = np.array(bank.candidates)
-    view = np.searchsorted(np.array(bank.offsets), candidates, side="right") - 1
-    keep = np.random.default_rng(seed).random(len(candidates)) < np.asarray(weights)[view]
-    bank.candidates = mi.UInt32(candidates[keep] if keep.any() else candidates)
-    return bank
-
-
 def mesh_stage(model: VolumeModel, run, options: CollectionOptions) -> dict[str, np.ndarray]:
     """Mesh, atlas, and each vertex's colour without light: vertices, faces, normals, uvs, albedo."""
     if run.done("mesh"):
@@ -259,7 +208,7 @@ def mesh_stage(model: VolumeModel, run, options: CollectionOptions) -> dict[str,
 def surface_options(options: CollectionOptions) -> SurfaceOptions:
     """Of the surface pass: longer passes do not exchange more scale between lights and base colour."""
     own = SurfaceOptions(options.surface_steps, options.points, options.directions, options.texture)
-    return replace(own, exchange_rate=min(own.exchange_rate, EXCHANGE / max(own.steps, 1)))
+    return replace(own, smooth_colour=SMOOTH_COLOUR, exchange_rate=min(own.exchange_rate, EXCHANGE / max(own.steps, 1)))
 
 
 def surface_stage(bank: PixelBank, mesh: Mesh, albedo, tints, run, options: CollectionOptions, seed: int) -> dict[str, np.ndarray]:

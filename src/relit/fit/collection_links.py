@@ -83,14 +83,16 @@ def with_focals(shots: list[Shot], groups: list[Group]) -> list[Shot]:
     return out
 
 
-def placed(group: Group, shots: list[Shot], directions: np.ndarray) -> tuple[np.ndarray, float]:
+def placed(group: Group, shots: list[Shot], directions: np.ndarray, heard=None) -> tuple[np.ndarray, float]:
     """Poses (n, 4, 4) of a group in the object's frame, the object within radius 1 about the origin, and the median angle to the hints
     (degrees; 0 where fewer than three photos have one). Without hints up is where the cameras' is, and the front is arbitrary.
+    heard: (n,) bool, photos whose masks say where the object is, or None.
 
     Raises UserError where the masks have no place in common.
     """
     cameras = [shots[i].camera.with_pose(p) for i, p in zip(group.photos, group.poses, strict=True)]
-    views = [View(c, None, shots[i].mask) for c, i in zip(cameras, group.photos, strict=True)]
+    heard = np.ones(len(cameras), bool) if heard is None else heard
+    views = [View(c, None, shots[i].mask) for c, i, h in zip(cameras, group.photos, heard, strict=True) if h]
     sphere, _ = find_sphere(views, group.points)
     centres = group.poses[:, :3, 3] - sphere.centre
     toward = centres / np.linalg.norm(centres, axis=1, keepdims=True)
@@ -119,7 +121,7 @@ def poses_from_links(
     """
     if not groups or len(groups[0].photos) < min(BEGINS, max(FEWEST, NEARLY_ALL * len(crops))):
         return None
-    members = groups[0].photos
+    members, everyone = groups[0].photos, np.ones(len(groups[0].photos), bool)
     try:
         own, angle = placed(groups[0], shots, directions)
     except UserError as error:
@@ -129,28 +131,60 @@ def poses_from_links(
         say(f"note: the linked photos contradict the hints ({angle:.0f} degrees at the median): they are not used")
         return None
     count = len(crops)
-    poses, scores, held = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count), np.zeros(count, bool)
-    poses[members] = own
-    some = [crops[i] for i in members]
-    model = coarse_model(some, own, 48, 150, 0.12, seed, depth_limit(some, own, 48) if len(crops) < FEW else None)
-    render = volume_render(model)
-    _, scores[members] = refine(some, own, render, rings=crop_rings(some, PARTS), steps=(), parts=PARTS)
-    mean = float(scores[members].mean())
+    poses, scores = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count)
+    held, doubted = np.zeros((2, count), bool)
+    model, agree = begun_with(crops, members, own, everyone, seed)
+    mean = float(agree.mean())
     say(f"{len(members)} linked photos begin the shape: mean score {mean:.3f}")
     if mean < FITS:
-        say("note: they do not fit a common shape and are not used")
-        return None
+        found = without_one(crops, groups[0], shots, directions, seed)
+        if found is None:
+            say("note: they do not fit a common shape and are not used")
+            return None
+        own, model, agree, left_out = found
+        rest = float(np.delete(agree, left_out).mean())
+        doubted[members[left_out]] = True
+        say(f"note: without {shots[members[left_out]].photo.name} they do (mean score {rest:.3f}); look at its mask")
+    poses[members], scores[members] = own, agree
     held[members] = True
+    render = volume_render(model)
     others = np.flatnonzero(~held)
     for turn in range(2 if len(others) else 0):
         found, height = found_in(model, [crops[i] for i in others], directions[others], degrees, keep, seed + turn)
         poses[others], scores[others] = found, height
         poses, scores = voted(crops, groups[1:], poses, scores, render)
-        trusted = np.flatnonzero(held | (scores > np.median(scores[held]) - 0.05))
+        trusted = np.flatnonzero((held & ~doubted) | (scores > np.median(scores[held]) - 0.05))
         say(f"{len(trusted) - held.sum()} of {len(others)} other photos join: mean score {scores[others].mean():.3f}")
         model = coarse_model([crops[i] for i in trusted], poses[trusted], 48, 150, 0.12, seed + 1 + turn)
         render = volume_render(model)
     return poses, scores, held
+
+
+def begun_with(crops: list[Crop], members: np.ndarray, own: np.ndarray, heard: np.ndarray, seed: int):
+    """(a coarse model of the `heard` ones (n,) bool of a group's photos at their poses `own` (n, 4, 4), scores (n,) of all of them)."""
+    some = [crops[i] for i, h in zip(members, heard, strict=True) if h]
+    limit = depth_limit(some, own[heard], 48) if len(crops) < FEW else None
+    model = coarse_model(some, own[heard], 48, 150, 0.12, seed, limit)
+    whole = [crops[i] for i in members]
+    _, scores = refine(whole, own, volume_render(model), rings=crop_rings(whole, PARTS), steps=(), parts=PARTS)
+    return model, scores
+
+
+def without_one(crops: list[Crop], group: Group, shots: list[Shot], directions: np.ndarray, seed: int):
+    """(poses (n, 4, 4), model, scores (n,), which) of the few photos of a group but one, which is in its place as well but whose mask is
+    not heard: one mask that takes a glass beside the can along moves the middle and the size of all. None where none of them is to blame.
+    """
+    count, best, most = len(group.photos), None, FITS
+    for i in range(count if FEWEST < count < FEW else 0):
+        heard = np.arange(count) != i
+        try:
+            own, _ = placed(group, shots, directions, heard)
+            model, scores = begun_with(crops, group.photos, own, heard, seed)
+        except (UserError, ValueError):
+            continue
+        if scores[heard].mean() > most:
+            best, most = (own, model, scores, i), float(scores[heard].mean())
+    return best
 
 
 def found_in(model, crops: list[Crop], directions: np.ndarray, degrees: float, keep: int, seed: int):

@@ -19,7 +19,8 @@ class CollectionOptions:
     few together. least_score: of the registration, on average, and least_agreement: share of photos that find their place in a model of
     the others, below which the poses are taken for wrong. levels, level_steps, rays: of the volume pass; mask_weights: of its
     mask term, level by level: outlines of masks wander, and the surface would follow them into bumps. refine_cameras: step of the
-    camera corrections in it. faces, texture, surface_steps, points, directions: of mesh and surface pass. frozen_steps: of the fit of
+    camera corrections in it. hollows: flat faces of the hull that are asked whether a space lies under them that no silhouette shows
+    (fit/lids.py), 0 for none. faces, texture, surface_steps, points, directions: of mesh and surface pass. frozen_steps: of the fit of
     held-out photos. light_network: folder of Neural-PIL's network, which then takes the place of the shipped prior of lights.
     init_colour: weight of SAMURAI's L_init in the surface pass, a tenth of it after the share lambda_a of its steps (80k of 300k in the
     paper). lambda_c: sharpness of the soft assignment in the first and the last round. without: what an ablation switches off.
@@ -40,10 +41,11 @@ class CollectionOptions:
     mask_weights: tuple[float, ...] = (0.8, 0.2, 0.1)
     rays: int = 6144
     refine_cameras: float = 0.003
+    hollows: int = 3
     faces: int = 30_000
     texture: int = 512
     surface_steps: int = 1500
-    points: int = 4096
+    points: int = 8192
     directions: int = 32
     frozen_steps: int = 150
     light_network: str = ""
@@ -78,6 +80,7 @@ PRESETS = {
         "levels": (48, 80),
         "level_steps": (200, 250),
         "rays": 4096,
+        "hollows": 0,
         "faces": 10_000,
         "texture": 256,
         "surface_steps": 250,
