@@ -34,6 +34,7 @@ from relit.fit.collection_shape import opened_stage, volume_stage
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, posterior, start_collection_surface
 from relit.fit.pixels import PixelBank, place_cameras
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
+from relit.fit.unseen_paint import painted_over
 from relit.fit.volume import VolumeModel
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -75,7 +76,7 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
     cameras = opened_stage(bank, shots, cameras, model, tints, run, options, seed)
     parts = mesh_stage(model, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
-    maps = surface_stage(bank, mesh, parts["albedo"], tints, run, options, seed)
+    maps = surface_stage(bank, cameras, mesh, parts["albedo"], tints, run, options, seed)
     found = held_out_stage(held, shots, model, mesh, parts["albedo"], maps, cameras, degrees, run, options, seed)
     return assemble(shots + held, cameras + found[0], np.concatenate([maps["lights"], found[1]]), mesh, maps, [s.photo.name for s in held])
 
@@ -211,8 +212,9 @@ def surface_options(options: CollectionOptions) -> SurfaceOptions:
     return replace(own, smooth_colour=SMOOTH_COLOUR, exchange_rate=min(own.exchange_rate, EXCHANGE / max(own.steps, 1)))
 
 
-def surface_stage(bank: PixelBank, mesh: Mesh, albedo, tints, run, options: CollectionOptions, seed: int) -> dict[str, np.ndarray]:
-    """Material and lights. Returns (and keeps) base_color, roughness, metallic, normal, lights (V, ROWS, COLUMNS, 3) in the unit frame."""
+def surface_stage(bank: PixelBank, cameras, mesh: Mesh, albedo, tints, run, options: CollectionOptions, seed: int) -> dict[str, np.ndarray]:
+    """Material and lights; what no photo shows is painted like what is next to it. Returns (and keeps) base_color, roughness, metallic,
+    normal, lights (V, ROWS, COLUMNS, 3) in the unit frame."""
     if run.done("surface"):
         return run_arrays(run, "surface", "maps")
     o = surface_options(options)
@@ -229,10 +231,10 @@ def surface_stage(bank: PixelBank, mesh: Mesh, albedo, tints, run, options: Coll
         silent = int((model.weights < 0.3).sum())
         if silent:
             run.say(f"note: {silent} photos were all but silenced: the model does not explain them")
+        paint = {"base_color": base, "roughness": roughness, "metallic": metallic}
+        paint = painted_over(mesh, cameras, {n: fill_gutters(t, known) for n, t in paint.items()}, face, bary)
         maps = {
-            "base_color": fill_gutters(base, known),
-            "roughness": fill_gutters(roughness, known),
-            "metallic": fill_gutters(metallic, known),
+            **paint,
             "normal": normal_map(model.material),
             "lights": np.exp(model.lights()).reshape(-1, ROWS, COLUMNS, 3),
             "weights": model.weights,

@@ -32,6 +32,7 @@ from relit.scene import Camera
 AGAIN = 600  # viewpoints that a finished model is looked at from
 CHOICES = 6  # places of each photo that are looked into
 ELSEWHERE = 20.0  # degrees: what is nearer is found by descent
+LONGER = 3  # times `frozen_steps` that held-out photos descend: they have no further pass to arrive in
 FAR = 30.0  # degrees from which on fine detail decides
 WORSE = 0.06  # by which the score of a place may be lower for fine detail to decide
 GAIN = 0.03  # by which another pose must score better than the present one: sides that look alike differ by .01 from light alone
@@ -48,7 +49,7 @@ def held_out_stage(held, shots, model: VolumeModel, mesh, albedo, maps, cameras,
         with run.stage("held_out", steps=options.frozen_steps, title="photos that were set aside") as stage:
             new = [replace(s, camera=with_median_field(s, cameras)) for s in held]
             found = register(new, model, degrees, options, seed)
-            found = descend(new, found, model, options, seed)
+            found = descend(new, found, model, options, seed, LONGER)
             found = told_by_others(new, found, shots, cameras, mesh, model, degrees, options, seed)
             bank = make_bank(found, [s.rgb for s in new], [s.mask for s in new])
             size = maps["roughness"].shape[0]
@@ -178,8 +179,8 @@ def turn_between(a: np.ndarray, b: np.ndarray) -> float:
     return rotation_angle(a[:3, :3].T @ b[:3, :3])
 
 
-def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, options: CollectionOptions, seed: int) -> list[Camera]:
-    """The cameras after a descent with the shape frozen: pose, distance, focal length and small lights move."""
+def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, options: CollectionOptions, seed: int, longer=1) -> list[Camera]:
+    """The cameras after a descent with the shape frozen: pose, distance, focal length and small lights move. longer: in `frozen_steps`."""
     bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
     learnt, rates = start_photo_lights(np.array([s.tint for s in shots]), GREY)
@@ -187,7 +188,7 @@ def descend(shots: list[Shot], cameras: list[Camera], model: VolumeModel, option
     own.grid = replace(model.grid)
     o = VolumeOptions(
         (model.grid.n,),
-        (max(60, options.frozen_steps),),
+        (longer * max(60, options.frozen_steps),),
         options.rays // 2,
         sdf_rate=0.0,
         feature_rate=0.0,
