@@ -40,13 +40,29 @@ def test_right_poses_have_less_misfit_than_wrong_ones(photos, crops, monkeypatch
     assert few.misfit(crops, right, 0) < 0.7 * few.misfit(crops, wrong, 0)
 
 
-def test_the_way_that_explains_the_photos_is_taken_whatever_its_score(crops, monkeypatch):
+@pytest.mark.parametrize(("score", "taken"), [(0.95, 1), (0.9, 0)])
+def test_the_way_that_explains_the_photos_is_taken_unless_it_lost_some(crops, monkeypatch, score, taken):
     from relit.fit import collection_few as few
 
-    a, b = np.zeros((len(crops), 4, 4)), np.ones((len(crops), 4, 4))
-    monkeypatch.setattr(few, "misfit", lambda _, poses, __: 0.2 if poses is a else 0.1)
-    ways = {"one": lambda: (a, np.full(len(crops), 0.99)), "two": lambda: (b, np.full(len(crops), 0.9))}
-    assert few.best_way(crops, ways, 0, quiet)[0] is b
+    ends = np.zeros((len(crops), 4, 4)), np.ones((len(crops), 4, 4))
+    monkeypatch.setattr(few, "misfit", lambda _, poses, __: 0.2 if poses is ends[0] else 0.1)
+    ways = {"one": lambda: (ends[0], np.full(len(crops), 0.99)), "two": lambda: (ends[1], np.full(len(crops), score))}
+    assert few.best_way(crops, ways, 0, quiet)[0] is ends[taken]
+
+
+@pytest.mark.parametrize(("heights", "ends"), [((0.9, 0.92, 0.93), 2), ((0.9, 0.87, 0.88), 2), ((0.9, 0.91, 0.8), 1)])
+def test_a_search_that_loses_photos_is_taken_back(monkeypatch, heights, ends):
+    from relit.fit import collection_few as few
+
+    asked = []
+
+    def polish(_, poses, *rest, **__):
+        asked.append(poses)
+        return poses + 1, np.full(6, heights[len(asked) - 1])
+
+    monkeypatch.setattr(few, "polish", polish)
+    poses, scores = few.polished([None] * 6, np.zeros((6, 4, 4)), None, 45.0, 1, 0, quiet, 3)
+    assert len(asked) == 3 and (poses == ends + 1).all() and (scores == heights[ends]).all()
 
 
 def test_ways_that_fail_are_passed_over(crops, monkeypatch):

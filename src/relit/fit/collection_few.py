@@ -19,6 +19,7 @@ from relit.fit.register import Crop
 
 FEW = 24  # photos below which the ways are held against each other
 NODES, STEPS = 48, 200  # of the fit that tells
+BEHIND = 0.05  # mean score by which poses may lie behind others and still be taken: photos that a search lost fit nothing
 
 Way = Callable[[], tuple[np.ndarray, np.ndarray]]
 
@@ -32,9 +33,9 @@ def misfit(crops: list[Crop], poses: np.ndarray, seed: int) -> float:
 
 
 def best_way(crops: list[Crop], ways: dict[str, Way], seed: int, say) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (P, 4, 4) and scores (P,) of the way with the least misfit. Ways that raise ValueError are passed over; raises ValueError when
-    all do."""
-    best, least, failed = None, np.inf, None
+    """Poses (P, 4, 4) and scores (P,) of the way with the least misfit, of those that are not BEHIND. Ways that raise ValueError are passed
+    over; raises ValueError when all do."""
+    found, failed = [], None
     for name, way in ways.items():
         try:
             poses, scores = way()
@@ -44,11 +45,24 @@ def best_way(crops: list[Crop], ways: dict[str, Way], seed: int, say) -> tuple[n
             failed = error
             continue
         say(f"{name}: mean score {scores.mean():.3f}, misfit {wrong:.4f}")
-        if best is None or wrong < least:
-            best, least = (poses, scores), wrong
-    if best is None:
+        found.append((wrong, poses, scores))
+    if not found:
         raise failed or ValueError("there is no way")
-    return best
+    most = max(scores.mean() for *_, scores in found)
+    return min((f for f in found if f[2].mean() >= most - BEHIND), key=lambda f: f[0])[1:]
+
+
+def polished(crops: list[Crop], poses, directions: np.ndarray, degrees: float, keep: int, seed: int, say, cycles: int):
+    """As `collection_poses.polish`, but a cycle whose search loses photos (the mean score falls by more than BEHIND) is taken back, and is
+    the last one."""
+    best = None
+    for i in range(cycles):
+        poses, scores = polish(crops, poses, directions, degrees, keep, seed, say, i + 1, limited=True, begun=i)
+        if best is not None and scores.mean() < best[1].mean() - BEHIND:
+            say("the last search lost photos and is taken back")
+            return best
+        best = (poses, scores)
+    return poses, scores
 
 
 def few_from_hints(
@@ -56,13 +70,12 @@ def few_from_hints(
 ):
     """As `collection_poses.poses_from_hints` with `polish` after it, for few photos, all of which have hints."""
 
-    def polished(poses):
-        return polish(crops, poses, directions, degrees, keep, seed, say, cycles, limited=True)
-
     def descent_first():
-        return polished(gauge(crops, np.array([pose_towards(c, d) for c, d in zip(crops, directions, strict=True)])))
+        begun = gauge(crops, np.array([pose_towards(c, d) for c, d in zip(crops, directions, strict=True)]))
+        return polished(crops, begun, directions, degrees, keep, seed, say, cycles)
 
     def search_first():
-        return polished(poses_from_hints(crops, directions, degrees, schedule, seed, say, keep, soft, limited=True)[0])
+        begun = poses_from_hints(crops, directions, degrees, schedule, seed, say, keep, soft, limited=True)[0]
+        return polished(crops, begun, directions, degrees, keep, seed, say, cycles)
 
     return best_way(crops, {"descent first": descent_first, "search first": search_first}, seed, say)

@@ -14,7 +14,7 @@ import numpy as np
 from relit.cameras.se3 import rotation_from
 from relit.conventions import similarity
 from relit.fit.collection_depth import ONE_SIDE, depth_limit, inflated
-from relit.fit.collection_few import FEW, best_way, few_from_hints
+from relit.fit.collection_few import FEW, best_way, few_from_hints, polished
 from relit.fit.collection_pairs import agreeing, pairs_of, placed_towards
 from relit.fit.collection_poses import (
     HOPELESS,
@@ -221,7 +221,7 @@ def few_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say, cyc
 
     def grown_from(photo: int):
         poses, _ = settle(crops, *grow(crops, photo, sizes, seed, say, rings, above=ABOVE), rings, keep, seed, say, limited=True)
-        return polish(crops, poses, none, 45.0, keep, seed, say, cycles, limited=True)
+        return polished(crops, poses, none, 45.0, keep, seed, say, cycles)
 
     ways = {f"grown from photo {k}": lambda k=k: grown_from(k) for k in start_photos(crops, rings, starts)}
     return best_way(crops, ways, seed, say)

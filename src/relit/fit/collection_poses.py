@@ -197,15 +197,25 @@ def descended(
 
 
 def polish(
-    crops: list[Crop], poses, directions: np.ndarray, degrees: float, keep: int, seed: int, say, cycles: int, held=None, limited=False
+    crops: list[Crop],
+    poses,
+    directions: np.ndarray,
+    degrees: float,
+    keep: int,
+    seed: int,
+    say,
+    cycles: int,
+    held=None,
+    limited=False,
+    begun: int = 0,
 ):
     """Descend, then search again in the sharper model: descent brings most photos to within a degree or two, the search the others.
-    held: (P,) bool, photos that only descend, or None. limited: see `depth_limit`."""
+    held: (P,) bool, photos that only descend, or None. limited: see `depth_limit`. begun: cycles that are over."""
     rings, scores = crop_rings(crops, PARTS), np.zeros(len(crops))
     held = np.zeros(len(crops), bool) if held is None else held
     still = np.array([is_cut(c) for c in crops]) | held  # a search by whole silhouettes tells nothing of cut ones
     hinted = np.linalg.norm(directions, axis=1) > 0.5
-    for i in range(cycles):
+    for i in range(begun, cycles):
         limit = depth_limit(crops, gauge(crops, poses), 48) if limited else None
         model, poses = descended(crops, poses, 48, 200, seed + 200 + i, held, limit)
         render = volume_render(replace(model, appearance=shade_plain))
@@ -220,7 +230,7 @@ def polish(
         scores = np.where(still, height, scores)
         scores = np.maximum(height, scores)
         say(
-            f"descent and search, {i + 1} of {cycles}: mean score {scores.mean():.3f}, {(~stays).sum()} photos found elsewhere",
+            f"descent and search, round {i + 1}: mean score {scores.mean():.3f}, {(~stays).sum()} photos found elsewhere",
             poses,
             scores,
         )
