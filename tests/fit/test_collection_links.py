@@ -200,3 +200,28 @@ def test_one_bad_mask_does_not_unlink_few_photos(bad):
     assert len(named) == (bad is not None)
     if bad is not None:
         assert f"without {bad}.png" in named[0] and scores.argmin() == bad
+
+
+def test_given_cameras_begin_the_shape_like_matches(monkeypatch):
+    """They are not matched again, and bring every photo to its place; one photo without a camera, and matches are asked."""
+    from relit.cameras.se3 import camera_errors
+    from relit.fit import collection_links as links
+    from relit.fit.collection_photos import crops_of
+
+    shots, poses = shots_of(8)
+    other, _ = turned(poses, np.random.default_rng(5))
+    given = [replace(s, given=p) for s, p in zip(shots, other, strict=True)]
+    groups = links.links_stage(given, None, 0)
+    assert len(groups) == 1 and np.allclose(groups[0].focals, 1.1)
+    found, scores, held = links.poses_from_links(crops_of(given), groups, given, np.zeros((8, 3)), 45.0, 1, 0, lambda *_: None)
+    assert held.all() and camera_errors(found, poses)[0].max() < 1 and scores.mean() > 0.9
+
+    class Asked(Exception):
+        pass
+
+    def done(_):
+        raise Asked
+
+    run = type("Run", (), {"done": staticmethod(done)})
+    with pytest.raises(Asked):
+        links.links_stage([*given[:-1], shots[-1]], run, 0)

@@ -46,7 +46,10 @@ LOSS = 0.03  # of score that a photo may lose where its group wants it
 
 
 def links_stage(shots: list[Shot], run, seed: int) -> list[Group]:
-    """Groups of linked photos, kept in the run folder. None where pycolmap is missing or nothing matches."""
+    """Groups of linked photos, kept in the run folder: all of them where they come with cameras. None where pycolmap is missing or nothing
+    matches."""
+    if all(s.given is not None for s in shots):
+        return [group_of_cameras(shots)]
     names = ("photos", "poses", "focals", "points", "views")
     if run.done("links"):
         kept = run_arrays(run, "links", "groups")
@@ -61,6 +64,12 @@ def links_stage(shots: list[Shot], run, seed: int) -> list[Group]:
             groups = link_photos([_full(s) for s in shots], stage.folder / "work", seed, run.say)
         stage.save("groups", count=np.array(len(groups)), **{f"{n}{i}": getattr(g, n) for i, g in enumerate(groups) for n in names})
     return groups
+
+
+def group_of_cameras(shots: list[Shot]) -> Group:
+    """The given cameras as if matches had found them: believed like those, as far as the silhouettes agree."""
+    focals = np.array([s.camera.fx / max(s.camera.width, s.camera.height) for s in shots])
+    return Group(np.arange(len(shots)), np.array([s.given for s in shots]), focals, np.zeros((0, 3)), np.zeros(0, int))
 
 
 def _full(shot: Shot):

@@ -24,13 +24,14 @@ GIVEN = 20.0  # degrees that directions from given cameras may be off
 @dataclass(frozen=True)
 class Shot:
     """One photo, decoded. rgb: (H, W, 3) linear, mask: (H, W). camera: intrinsics by EXIF or guess, pose the identity.
-    direction: (3,) hint, or 0."""
+    direction: (3,) hint, or 0. given: (4, 4) world_from_camera in the capture's own frame, where hints are of given cameras, or None."""
 
     photo: Photo
     rgb: np.ndarray
     mask: np.ndarray
     camera: Camera
     direction: np.ndarray
+    given: np.ndarray | None = None
 
     @property
     def tint(self) -> np.ndarray:
@@ -51,7 +52,8 @@ def load_shots(capture: Capture, options: CollectionOptions, run) -> tuple[list[
         raise UserError(what, "shape is found by comparing photos from different sides", "add photos; 30 to 80 all around are good")
     use = options.hints and "quadrants" not in options.without
     hints = read_hints(capture.root, [p.name for p in (*photos, *held)]) if use else None
-    if hints is None and use and capture.has_cameras and capture.sphere is not None:
+    of_cameras = hints is None and use and capture.has_cameras and capture.sphere is not None
+    if of_cameras:
         hints = hints_of_cameras(capture, [*photos, *held])
     if hints is not None:
         run.say(f"{len(hints.directions)} of {len(photos) + len(held)} photos have a hint where they were taken from ({hints.source})")
@@ -67,7 +69,8 @@ def load_shots(capture: Capture, options: CollectionOptions, run) -> tuple[list[
         else:
             mask = np.clip(resize(mask, w, h), 0, 1)
         direction = np.zeros(3) if hints is None else hints.directions.get(photo.name, np.zeros(3))
-        shots.append(Shot(photo, rgb, mask, guessed_camera(photo, w, h), direction))
+        given = photo.camera.world_from_camera if of_cameras and photo.camera is not None else None
+        shots.append(Shot(photo, rgb, mask, guessed_camera(photo, w, h), direction, given))
     if guessed:
         run.say(f"note: {guessed} photos have no mask; they were guessed by GrabCut from the pictures' middle: look at them")
     empty = [s.photo.name for s in shots if (s.mask > 0.5).sum() < 30]
