@@ -54,9 +54,14 @@ assert libc.prctl(38, 1, 0, 0, 0) == 0 and libc.prctl(22, 2, program, 0, 0) == 0
 """
 # sums then come in one order: two runs of one job are the same to the last bit, whatever the photos
 ONE_THREAD = "import drjit; drjit.set_thread_count(1)\n"
-# true poses stand in for the search of a pile's
+# true poses stand in for the search of a pile's, and a ball in the middle for a hollow that takes many photos to find
 TOLD = """
 import os
+if "HOLLOW" in os.environ:
+    import numpy, relit.fit.collection_shape as shape
+    shape.PHOTOS = 4
+    x = numpy.stack(numpy.meshgrid(*3 * [numpy.linspace(-1, 1, shape.FIRST.nodes)], indexing="ij"), -1)
+    shape.open_lids = lambda *_, **__: (numpy.linalg.norm(x, axis=-1) - 0.15).astype(numpy.float32)
 if "TRUE_POSES" in os.environ:
     import numpy, relit.fit.duplicates_poses as poses
     poses.place_few = lambda views, *_, **__: (numpy.load(os.environ["TRUE_POSES"]), numpy.full(len(views), 0.95))
@@ -113,6 +118,11 @@ def collection_with_held_out(folder: Path) -> tuple[Path, list[str]]:
     return photos, words
 
 
+def collection_with_a_hollow(folder: Path) -> tuple[Path, list[str]]:
+    photos, words = collection_photos(folder)
+    return photos, [*words, "--set", "hollows=1"]
+
+
 def words_of(photos: Path, flags: list[str], run: Path) -> list[str]:
     tiny = [w for k, v in TINY.items() if k != "light" for w in ("--set", f"{k}={v}")]
     return ["reconstruct", str(photos), "-o", str(run), "--quality", "draft", "--device", "cpu", *tiny, *flags]
@@ -121,6 +131,7 @@ def words_of(photos: Path, flags: list[str], run: Path) -> list[str]:
 def job(prelude: str, *words: str, prepare=None):
     told = next((p for w in words for p in [Path(w).with_name("poses.npy")] if p.is_file()), None)
     env = dict(os.environ) if told is None else {**os.environ, "TRUE_POSES": str(told)}
+    env |= {"HOLLOW": "1"} if "hollows=1" in words else {}
     command = [sys.executable, "-c", prelude + ONE_THREAD + TOLD + JOB, *words]
     return subprocess.run(command, capture_output=True, timeout=300, preexec_fn=prepare, env=env)
 
@@ -133,8 +144,9 @@ JOBS = [
     (room_photos, ["cameras"]),
     (unmasked_photos, ["explore"]),
     (flash_photos, ["volume", "mesh"]),
-    (pile_photo, ["poses", "joint", "volume", "surface"]),
+    (pile_photo, ["poses", "joint", "volume", "mesh", "surface"]),
     (collection_with_held_out, ["links", "poses", "second_look", "held_out"]),
+    (collection_with_a_hollow, ["volume", "hollows", "opened", "mesh", "surface"]),
 ]
 
 

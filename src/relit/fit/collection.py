@@ -59,7 +59,7 @@ ALIKE = 0.15
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("links", "poses", "volume", "second_look", "hollows", "opened", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
-COST = {"draft": (150.0, 1.2e9), "standard": (300.0, 1.5e9), "high": (2500.0, 3.0e9)}
+COST = {"draft": (150.0, 1.2e9), "standard": (360.0, 1.8e9), "high": (2500.0, 3.0e9)}
 
 
 def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0) -> Asset:
