@@ -15,7 +15,7 @@ from relit.conventions import srgb_from_linear, world_from_gl_camera
 from relit.errors import UserError
 from relit.preflight import inspect
 from relit.preflight.cameras import fundamental, match, widest_gap
-from relit.preflight.drift import drift
+from relit.preflight.drift import drift, warnings_of
 from relit.preflight.light import LIMB, check_flash_light, light_regime, limb_slopes, shading_fits
 from relit.preflight.look import Exif, look_at_photos, read_exif, sharpness
 from relit.scene import Camera, Capture, Photo, Pixels, Sphere
@@ -211,6 +211,10 @@ def test_blur_exposure_and_tint_are_found(tmp_path):
     assert rows["5.png"]["ev"] == pytest.approx(2 + rows["4.png"]["ev"], abs=0.5)
     assert rows["7.png"]["red"] == pytest.approx(np.log2(1.5), abs=0.2) and abs(rows["7.png"]["blue"]) < 0.2
     assert found["exif_exposure_spread"] is None and found["cameras"] == []
+    shifted = found | {"exif_exposure_spread": 1.4, "tint_spread": 1.0}
+    said = [w["what"] for w in warnings_of(shifted, True)]
+    assert len(said) == 3 and "exposure: 1.4 EV" in said[0] and "colour varies" in said[1]
+    assert [w["what"] for w in warnings_of(shifted, True, from_anywhere=True)] == said[2:]  # photos from anywhere differ in both
 
 
 def test_sharpness_is_of_the_photo_not_of_what_it_shows():

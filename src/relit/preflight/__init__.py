@@ -38,6 +38,7 @@ def inspect(input: str | Path, job: Job, plot: Path | None = None, html: Path | 
     looks = look_at_photos(capture)
     regime, drifts, (epipolar, pairs) = light_regime(capture, looks), drift(looks), agreement(looks)
     around, masks = coverage(capture), mask_coverage(looks)
+    unsteady = drift_warnings(drifts, masks is not None, from_anywhere=kind == "collection")
     found = {
         "input": str(input),
         "format": capture.format,
@@ -55,7 +56,7 @@ def inspect(input: str | Path, job: Job, plot: Path | None = None, html: Path | 
         "light": recipe.LIGHT,
         "light_regime": regime,
         "drift": drifts,
-        "warnings": [*_of_light(kind, regime), *camera_warnings(epipolar, around), *drift_warnings(drifts, masks is not None)],
+        "warnings": [*_of_light(kind, regime), *camera_warnings(epipolar, around), *unsteady],
         "notes": list(capture.notes),
         "stages": ([] if finds_cameras else ["cameras"]) + [*recipe.STAGES, "asset", "report"],
         "estimate": {"seconds": round(cost.seconds), "memory": round(cost.memory), "disk": round(cost.disk), "quality": job.quality},
@@ -79,7 +80,8 @@ def _of_light(kind: str, regime: dict) -> list[dict]:
         "moving light": "one viewpoint with a moving lamp is not reconstructed: photograph from all around",
         "fixed": "if the lamps stood still: --capture multiview",
     }
-    return [{"what": f"the light looks {guess}, and a {kind} capture expects {' or '.join(EXPECTED[kind])} light", "fix": advice[guess]}]
+    looks = guess.removesuffix(" light")
+    return [{"what": f"the light looks {looks}, and a {kind} capture expects {' or '.join(EXPECTED[kind])} light", "fix": advice[guess]}]
 
 
 def write_plot(path: Path, capture: Capture) -> None:

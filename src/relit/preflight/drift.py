@@ -43,29 +43,26 @@ def _colour(x: Look) -> tuple[float, float, float]:
     return float(np.log2(max(float(np.array([0.2126, 0.7152, 0.0722]) @ np.exp2([r, g, b])), 1e-4))), float(r - g), float(b - g)
 
 
-def warnings_of(found: dict, has_masks: bool) -> list[dict]:
-    """What to say of `drift`'s answer."""
+def warnings_of(found: dict, has_masks: bool, from_anywhere: bool = False) -> list[dict]:
+    """What to say of `drift`'s answer. from_anywhere: each photo has an exposure and a white of its own (a collection)."""
+    out = [] if from_anywhere else _unsteady(found, has_masks)
+    if found["blurred"]:
+        listed = ", ".join(found["blurred"][:5]) + (" ..." if len(found["blurred"]) > 5 else "")
+        what = f"{len(found['blurred'])} photos are less sharp than the others: {listed}"
+        out.append({"what": what, "fix": "leave them out, or take them again"})
+    return out
+
+
+def _unsteady(found: dict, has_masks: bool) -> list[dict]:
     out = []
     spread = found["exif_exposure_spread"]
     if spread is not None and spread > EXPOSURE_DRIFT:
-        out.append(
-            {
-                "what": f"the camera changed its exposure: {spread:.1f} EV from photo to photo (EXIF)",
-                "fix": "lock exposure; until then the light's brightness is an average",
-            }
-        )
+        what = f"the camera changed its exposure: {spread:.1f} EV from photo to photo (EXIF)"
+        out.append({"what": what, "fix": "lock exposure; until then the light's brightness is an average"})
     elif spread is None and has_masks and found["exposure_spread"] > 3.5 * EXPOSURE_DRIFT:
         what = f"the object's brightness varies by {found['exposure_spread']:.1f} EV from photo to photo"
         out.append({"what": what, "fix": "lock exposure, or look at the light regime"})
     if has_masks and found["tint_spread"] > 4.5 * TINT_DRIFT:
         what = f"the object's colour varies by {found['tint_spread']:.2f} (log2) between photos"
         out.append({"what": what, "fix": "lock white balance; mixed light shows so as well"})
-    if found["blurred"]:
-        listed = ", ".join(found["blurred"][:5]) + (" ..." if len(found["blurred"]) > 5 else "")
-        out.append(
-            {
-                "what": f"{len(found['blurred'])} photos are less sharp than the others: {listed}",
-                "fix": "leave them out, or take them again",
-            }
-        )
     return out
