@@ -134,3 +134,7 @@ def test_what_is_said_of_photos_that_are_not_borne_out():
     assert "most photos" in said([0.5, 0.1, -1.0])[1] and len(said([0.5, 0.1, -1.0], [1, 2])) == 2
     assert "3.jpg" in said([0.5] * 9, [3])[1] and "alike" not in said([0.5] * 9, [3])[1]
     assert "alike from several sides" in said([0.5] * 9, [0, 3])[1] and "90 degrees" in said([0.5] * 9, [0, 3])[1]
+    # whose own place is not borne out says nothing of the object
+    assert len(said([0.5] * 6 + [0.1] * 4, [6, 7, 8, 9])) == 2 and "9.jpg" in said([0.5] * 6 + [0.1] * 4, [6, 7, 8, 9])[1]
+    assert "1 of 6 photos fit" in said([0.5] * 6 + [0.1] * 4, [0, 6, 7])[2] and "alike" in said([0.5] * 6 + [0.1] * 4, [0])[2]
+    assert said([0.5] * 12 + [0.1] * 11)[1].endswith("21.jpg ...")

@@ -56,6 +56,7 @@ BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to
 # share of photos that fit as well elsewhere from which on the object is called alike from several sides: the stool of the suite
 # `collection` has .02 with quadrants and .32 without
 ALIKE = 0.15
+LISTED = 10  # photos that are named at once
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
 STAGES = ("links", "poses", "volume", "second_look", "hollows", "opened", "mesh", "surface", "held_out")
 FINDS_CAMERAS = True
@@ -178,17 +179,19 @@ def say_borne_out(detail: np.ndarray, as_well: np.ndarray, names: list[str], run
         )
         return  # what fits as well elsewhere then says nothing of the object
     if len(low):
-        run.say(f"note: not borne out by the others in fine detail: {', '.join(names[i] for i in low[np.argsort(detail[low])][:5])}")
-    unsure = np.flatnonzero(as_well)
+        listed = ", ".join(names[i] for i in low[np.argsort(detail[low])][:LISTED]) + (" ..." if len(low) > LISTED else "")
+        run.say(f"note: not borne out by the others in fine detail (another object, a wrong place, or a plain side): {listed}")
+    placed = detail >= BORNE_OUT  # of the others no place is known, so that other places say nothing of the object
+    unsure = np.flatnonzero(as_well * placed)
     if len(unsure):
-        turn = f"{len(unsure)} of {len(detail)} photos fit about as well elsewhere, turned by {np.median(as_well[unsure]):.0f} degrees"
-        if len(unsure) > ALIKE * len(detail):
+        turn = f"{len(unsure)} of {placed.sum()} photos fit about as well elsewhere, turned by {np.median(as_well[unsure]):.0f} degrees"
+        if len(unsure) > ALIKE * placed.sum():
             run.say(
                 f"note: {turn}: the object is alike from several sides, and the poses hold up to such turns only: "
                 "colours of one side may stand on another; answer `relit quadrants PHOTOS`"
             )
         else:
-            run.say(f"note: {turn}: {', '.join(names[i] for i in unsure[:5])}")
+            run.say(f"note: {turn}: {', '.join(names[i] for i in unsure[:LISTED])}")
 
 
 def mesh_stage(model: VolumeModel, run, options: CollectionOptions) -> dict[str, np.ndarray]:
