@@ -2,6 +2,8 @@
 
 import json
 import threading
+from dataclasses import replace
+from pathlib import Path
 from urllib.request import Request, urlopen
 
 import numpy as np
@@ -38,6 +40,13 @@ def test_terminal(capture):
     assert np.allclose(hints.directions["2.png"], [0, 1, 0])
     ask_in_terminal(capture, lambda text: "d" if text.startswith("1.png (1 of 1)") else pytest.fail(text), said.append)  # only what is left
     assert len(json.loads(path.read_text())["frames"]) == 3
+
+
+def test_photos_that_are_set_aside_are_asked_for_among_the_others(capture):
+    aside = replace(capture, photos=capture.photos[:1] + capture.photos[2:], held_out=capture.photos[1:2])
+    asked = []
+    ask_in_terminal(aside, lambda text: asked.append(text.split()[0]) or "a", lambda _: None)
+    assert [Path(name).name for name in asked] == ["0.png", "1.png", "2.png"]
 
 
 def test_directions_and_answers_are_inverse():

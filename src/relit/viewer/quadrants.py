@@ -11,7 +11,7 @@ from relit.capture.samurai import QUADRANTS, direction_of, quadrant_of
 from relit.errors import UserError
 from relit.files import write_text
 from relit.images import encode_jpeg
-from relit.scene import Capture
+from relit.scene import Capture, Photo
 from relit.viewer.photos import shrunk
 from relit.viewer.serve import Server, open_port
 
@@ -69,6 +69,11 @@ def guesses_of(run: str | Path) -> dict[str, list[str]]:
     return {Path(name).name: quadrant_of(camera.centre) for name, camera in cameras}
 
 
+def in_order(capture: Capture) -> list[Photo]:
+    """All photos by their names, those that are set aside among the others: neighbours were mostly taken one after the other."""
+    return sorted((*capture.photos, *capture.held_out), key=lambda p: p.name)
+
+
 def ask_in_terminal(
     capture: Capture,
     ask: Callable[[str], str] = input,
@@ -80,7 +85,7 @@ def ask_in_terminal(
     root, guesses = capture.folder, guesses or {}
     answers = read_answers(root)
     say(EXPLAINED)
-    todo = [p.name for p in (*capture.photos, *capture.held_out) if Path(p.name).name not in answers]
+    todo = [p.name for p in in_order(capture) if Path(p.name).name not in answers]
     for i, name in enumerate(todo):
         guess = guesses.get(Path(name).name)
         offer = "" if guess is None else f" [{' '.join(guess)}]"
@@ -107,7 +112,7 @@ def ask_in_terminal(
 
 def quadrant_server(capture: Capture, port: int = 0, guesses: Mapping[str, list[str]] | None = None) -> Server:
     """A server of the page; every answer is saved at once. guesses: shown as chosen, until Enter makes them answers."""
-    photos, root, guesses = (*capture.photos, *capture.held_out), capture.folder, guesses or {}
+    photos, root, guesses = in_order(capture), capture.folder, guesses or {}
 
     def state() -> dict:
         answers = read_answers(root)
