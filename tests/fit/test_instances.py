@@ -12,7 +12,22 @@ from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_growth import Growth, grow, linked_poses
 from relit.fit.instance_lookup import look_for
-from relit.fit.instance_search import APART, Guesses, Search, ambiguous, crops_of, first_pairs, nearer, place, reconsider, trusted
+from relit.fit.instance_search import (
+    APART,
+    DETAILED,
+    LOW,
+    PARTS,
+    Guesses,
+    Search,
+    ambiguous,
+    crops_of,
+    first_pairs,
+    nearer,
+    place,
+    reconsider,
+    regrown,
+    trusted,
+)
 from relit.fit.instances import (
     albedo_render,
     carved,
@@ -215,6 +230,45 @@ def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
     left = reconsider(views, crops, rings, poses.copy(), scores, replace(o, doubted=4), seed=0, parts=parts, sure={0, 1, 2, 3})
     assert np.array_equal(left[0], poses) and left[2] == []  # who is sure is not asked
     assert nearer(found[1], truth[1], wrong_pose) and not nearer(wrong_pose, truth[1], wrong_pose)
+
+
+def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
+    """Which, and that it is kept, by real models; what growth does is tested above."""
+    from relit.fit import instance_search
+
+    views, truth = painted([0, 20, 40, 60, 80, 100])
+    crops, o, said, members = crops_of(views), Search(nodes=24, steps=12), [], []
+
+    def grown(views, crops, rings, parts, rest, poses, *_, **__):
+        assert parts == DETAILED
+        members.append(rest)
+        return truth.copy(), np.ones(6)
+
+    monkeypatch.setattr(instance_search, "LOW", LOW / 2)  # eight colours tell less than a print
+    monkeypatch.setattr(instance_search, "grow", grown)
+    monkeypatch.setattr(instance_search, "descend", lambda v, c, r, poses, scores, *_, **__: (poses, scores))
+    poses = truth.copy()
+    for k in (1, 2):
+        poses[k] = similarity(exp_so3(np.array([0.0, np.radians(110), 0.0])), np.zeros(3)) @ truth[k]
+    found, scores = regrown(views, crops, crop_rings(crops, PARTS), poses, np.zeros(6), o, seed=0, say=said.append)
+    assert members == [[0, 3, 4, 5]] and said[0].startswith(f"{views[1].label}, {views[2].label} taken out together")
+    assert np.array_equal(found, truth) and scores.tolist() == [1.0] * 6
+
+
+def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch):
+    from relit.fit import instance_search
+
+    views, truth = painted([0, 20, 40, 60])
+    crops = crops_of(views)
+    rings = crop_rings(crops, DETAILED)
+    for own, asked in (([0.9, 0.9, 0.85, 0.9], False), ([0.9, 0.9, 0.3, 0.9], True)):
+        judged = iter([np.array(own), np.array(own) - 0.1])
+        monkeypatch.setattr(instance_search, "model_of_all", lambda *_, judged=judged, **__: (None, next(judged)))
+        monkeypatch.setattr(instance_search, "descend", lambda v, c, r, poses, scores, *_, **__: (poses + 1, scores))
+        monkeypatch.setattr(instance_search, "grow", lambda v, c, r, p, members, poses, *_, **__: (poses + 1, np.ones(len(poses))))
+        said: list[str] = []
+        poses, _ = regrown(views, crops, rings, truth.copy(), np.ones(4), Search(), seed=0, say=said.append)
+        assert np.array_equal(poses, truth) and bool(said) == asked
 
 
 def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead():

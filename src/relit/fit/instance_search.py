@@ -35,6 +35,8 @@ STILL = 0.5  # degrees; descents that turn instances by less have arrived
 APART = 25.0  # degrees from which on a pose is another one
 UNSURE = 0.3  # see `ambiguous`
 GAP = 0.1  # an instance's score may lie so much below those of the best third
+LOW = 0.1  # see `regrown`: so much below the median
+REGROWN = 2  # times at most
 
 
 @dataclass(frozen=True)
@@ -204,6 +206,33 @@ def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, part
     return poses, scores, moved
 
 
+def regrown(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=PARTS, say=lambda text: None):
+    """Take all instances out that agree badly with a model of all, descend without them, and let them join again; (poses, scores).
+
+    Two in wrong places bear each other out: either is asked against a model that the other has spoilt (see `reconsider`). What comes out is
+    kept where all agree better with a model of all, in detail.
+    """
+    if len(views) < 4 or o.descents == 0:
+        return poses, scores
+    detail, own = crop_rings(crops, DETAILED), model_of_all(views, poses, o, seed=seed)[1]
+    for turn in range(REGROWN):
+        low = own < np.median(own) - LOW
+        if not low.any():
+            break
+        rest, again = np.flatnonzero(~low).tolist(), poses.copy()
+        some, theirs = [views[k] for k in rest], [crops[k] for k in rest]
+        again[rest], _ = descend(some, theirs, chosen_rings(rings, rest), again[rest], np.ones(len(rest)), o, seed=seed + turn, parts=parts)
+        again, level = grow(views, crops, detail, DETAILED, rest, again, o.growth, seed=seed + 10 + turn)
+        again, level = descend(views, crops, rings, again, level, o, seed=seed + 20 + turn, parts=parts)
+        better = model_of_all(views, again, o, seed=seed)[1]
+        names = ", ".join(str(views[k].label) for k in np.flatnonzero(low))
+        say(f"{names} taken out together and grown again: agreement of all with a model of all {own.mean():.3f} -> {better.mean():.3f}")
+        if better.mean() <= own.mean():
+            break
+        poses, scores, own = again, level, better
+    return poses, scores
+
+
 def nearer(pose: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
     """Whether a pose (4, 4) is turned less against a than against b."""
     return rotation_angle(pose[:3, :3].T @ a[:3, :3]) < rotation_angle(pose[:3, :3].T @ b[:3, :3])
@@ -283,6 +312,7 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         say(f"note: the poses are uncertain, {skill:.2f} above chance where {o.convincing:.2f} convinces: is the object nearly symmetric?")
     poses, scores = settle(views, crops, rings[parts], poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
     poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 20, parts=parts, say=say)
+    poses, scores = regrown(views, crops, rings[parts], poses, scores, o, seed=seed + 100, parts=parts, say=say)
     detail = crop_rings(crops, DETAILED)  # colour alone puts a spotted cow on any of its white sides
     late, sure = False, set()
     for turn in range(o.rounds_doubted if o.descents and len(views) > 2 else 0):
@@ -298,4 +328,4 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         poses, scores = descend(views, crops, rings[parts], poses, scores, o, seed=seed + 50 + turn, parts=parts, say=say)
         if np.median([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(before, poses, strict=True)]) < STILL:
             break
-    return poses, scores
+    return regrown(views, crops, rings[parts], poses, scores, o, seed=seed + 200, parts=parts, say=say) if late else (poses, scores)
