@@ -144,7 +144,9 @@ JOBS = [
     (room_photos, ["cameras"]),
     (unmasked_photos, ["explore"]),
     (flash_photos, ["volume", "mesh"]),
-    (pile_photo, ["poses", "joint", "volume", "mesh", "surface"]),
+    (flash_photos, ["surface"]),  # resumed in the mesh, the volume pass is taken up at its end and is done once more
+    (pile_photo, ["poses", "joint", "volume", "surface"]),
+    (pile_photo, ["mesh"]),
     (collection_with_held_out, ["links", "poses", "second_look", "held_out"]),
     (collection_with_a_hollow, ["volume", "hollows", "opened", "mesh", "surface"]),
 ]
