@@ -26,6 +26,7 @@ from relit.fit.duplicates_options import DuplicatesOptions, options_for
 from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.duplicates_shape import shape_stages
 from relit.fit.first_material import PAINT, describe, first_material
+from relit.fit.hidden_light import HiddenLight, hidden_from
 from relit.fit.instances import ANOTHER_PHOTO
 from relit.fit.pile_scene import (
     alone_bank,
@@ -141,7 +142,10 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         model = start_surface(start, known, level, o, None, metallic, roughness)
         if options.gaussians:
             model.gaussians = GaussianLight(options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START)
-        fit_surface(bank, traced, model, o, stage, seed)
+        hidden = None
+        if "hidden" not in options.without and moves is None:
+            hidden = HiddenLight(traced, hidden_from(traced, cameras), traced.mesh.uvs[:, 0] < -0.5)
+        fit_surface(bank, traced, model, o, stage, seed, hidden)
         base, roughness, metallic = pictures(model.material)
         environment = model.environment.image()
         ground = ground_level

@@ -59,6 +59,7 @@ WITHOUT = {
     "normals": "normal priors are not used",
     "metal": "no term pulls metallic to 0 or 1",
     "ground": "no ground is looked for",
+    "hidden": "what no photo shows throws back what the volume pass makes of it, without shadows",
 }
 
 PRESETS = {

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.exchange import REFRESH, Exchange
+from relit.fit.hidden_light import HiddenLight
 from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels, saturated_at
@@ -123,8 +124,17 @@ def light_parameters(model: SurfaceModel):
     return model.log_light if model.gaussians is None else model.gaussians.parameters
 
 
-def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, options: SurfaceOptions, stage, seed: int = 0) -> SurfaceModel:
-    """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when there is one."""
+def fit_surface(
+    bank: PixelBank,
+    mesh: TraceableMesh,
+    model: SurfaceModel,
+    options: SurfaceOptions,
+    stage,
+    seed: int = 0,
+    hidden: HiddenLight | None = None,
+) -> SurfaceModel:
+    """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when there is one. hidden: keeps the radiance
+    of what no photo shows up to date."""
     material, environment, gaussians = model.material, model.environment, model.gaussians
     first = 0
     saved = stage.load("checkpoint")
@@ -136,6 +146,8 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
             model.log_light = mi.Float(saved["light"])
         else:
             gaussians.parameters = mi.Float(saved["light"])
+    if saved and hidden is not None:
+        mesh.radiance = mi.Float(saved["radiance"])
     if gaussians is not None:
         model.log_light = gaussians.log_radiance()
     environment.radiance = dr.exp(model.log_light)
@@ -156,6 +168,8 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
     def step(i: int) -> dict:
         decay = cosine_decay(i / options.steps, 0.05)
         warm = min(1.0, 0.05 + (i / (options.warm * light_steps)) ** 2)  # the light first: base colour could explain all shading at once
+        if hidden is not None and hidden.due(i, options.steps):
+            hidden.gather(material, environment, seed + i)
         batch, points = drawn_points(bank, mesh, rng, count)
         valid = points.valid
         near = neighbours(mesh, points, options.similarity_reach, rng)
@@ -228,6 +242,7 @@ def fit_surface(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, optio
         names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": light_parameters(model)}
         arrays = {name: np.array(value) for name, value in {**names, "metal": model.metal}.items()}
         followed = {} if exchange.light is None else {"followed": np.array(exchange.light)}
+        followed |= {} if hidden is None else {"radiance": np.array(mesh.radiance)}
         return arrays | followed | memory(rng, adam)
 
     def textures(uv, valid):
