@@ -271,6 +271,19 @@ def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch
         assert np.array_equal(poses, truth) and bool(said) == asked
 
 
+def test_silhouettes_without_anything_in_common_are_left_as_they_are(monkeypatch):
+    from relit.fit import instance_search
+
+    def nothing(*_, **__):
+        raise ValueError("the occupancy is empty or full")
+
+    views, truth = painted([0, 20, 40, 60])
+    crops = crops_of(views)
+    monkeypatch.setattr(instance_search, "model_of_all", nothing)
+    poses, _ = regrown(views, crops, crop_rings(crops, DETAILED), truth, np.ones(4), Search(), seed=0)
+    assert np.array_equal(poses, truth)
+
+
 def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead():
     views, truth = painted([0, 20, 40, 60])
     parts = (0.6, 2.0, 0.1)

@@ -214,22 +214,25 @@ def regrown(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=P
     """
     if len(views) < 4 or o.descents == 0:
         return poses, scores
-    detail, own = crop_rings(crops, DETAILED), model_of_all(views, poses, o, seed=seed)[1]
-    for turn in range(REGROWN):
-        low = own < np.median(own) - LOW
-        if not low.any():
-            break
-        rest, again = np.flatnonzero(~low).tolist(), poses.copy()
-        some, theirs = [views[k] for k in rest], [crops[k] for k in rest]
-        again[rest], _ = descend(some, theirs, chosen_rings(rings, rest), again[rest], np.ones(len(rest)), o, seed=seed + turn, parts=parts)
-        again, level = grow(views, crops, detail, DETAILED, rest, again, o.growth, seed=seed + 10 + turn)
-        again, level = descend(views, crops, rings, again, level, o, seed=seed + 20 + turn, parts=parts)
-        better = model_of_all(views, again, o, seed=seed)[1]
-        names = ", ".join(str(views[k].label) for k in np.flatnonzero(low))
-        say(f"{names} taken out together and grown again: agreement of all with a model of all {own.mean():.3f} -> {better.mean():.3f}")
-        if better.mean() <= own.mean():
-            break
-        poses, scores, own = again, level, better
+    try:
+        detail, own = crop_rings(crops, DETAILED), model_of_all(views, poses, o, seed=seed)[1]
+        for turn in range(REGROWN):
+            low = own < np.median(own) - LOW
+            if not low.any():
+                break
+            rest, again = np.flatnonzero(~low).tolist(), poses.copy()
+            some, theirs = [views[k] for k in rest], [crops[k] for k in rest]
+            again[rest], _ = descend(some, theirs, chosen_rings(rings, rest), again[rest], np.ones(len(rest)), o, seed=seed + turn, parts=parts)
+            again, level = grow(views, crops, detail, DETAILED, rest, again, o.growth, seed=seed + 10 + turn)
+            again, level = descend(views, crops, rings, again, level, o, seed=seed + 20 + turn, parts=parts)
+            better = model_of_all(views, again, o, seed=seed)[1]
+            names = ", ".join(str(views[k].label) for k in np.flatnonzero(low))
+            say(f"{names} taken out together and grown again: agreement of all with a model of all {own.mean():.3f} -> {better.mean():.3f}")
+            if better.mean() <= own.mean():
+                break
+            poses, scores, own = again, level, better
+    except ValueError:  # the silhouettes have nothing in common
+        pass
     return poses, scores
 
 
