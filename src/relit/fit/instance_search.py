@@ -221,8 +221,8 @@ def regrown(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=P
             if not low.any():
                 break
             rest, again = np.flatnonzero(~low).tolist(), poses.copy()
-            some, theirs = [views[k] for k in rest], [crops[k] for k in rest]
-            again[rest], _ = descend(some, theirs, chosen_rings(rings, rest), again[rest], np.ones(len(rest)), o, seed=seed + turn, parts=parts)
+            some, theirs, own_rings = [views[k] for k in rest], [crops[k] for k in rest], chosen_rings(rings, rest)
+            again[rest], _ = descend(some, theirs, own_rings, again[rest], np.ones(len(rest)), o, seed=seed + turn, parts=parts)
             again, level = grow(views, crops, detail, DETAILED, rest, again, o.growth, seed=seed + 10 + turn)
             again, level = descend(views, crops, rings, again, level, o, seed=seed + 20 + turn, parts=parts)
             better = model_of_all(views, again, o, seed=seed)[1]
