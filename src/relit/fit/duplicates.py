@@ -38,6 +38,7 @@ from relit.fit.pile_scene import (
     spread,
 )
 from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
+from relit.fit.unseen_paint import painted_over
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.mesh import vertex_areas
 from relit.lighting.gaussian_light import GaussianLight
@@ -107,8 +108,8 @@ def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
 
 
 def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: DuplicatesOptions, seed: int) -> dict[str, np.ndarray]:
-    """Material and light, in the scene frame: the world's axes, unit lengths of the object, the origin in the middle of the pile. Returns
-    (and keeps) base_color, roughness, metallic, normal, environment, ground_colour."""
+    """Material and light, in the scene frame: the world's axes, unit lengths of the object, the origin in the middle of the pile. What no
+    instance shows is painted like what is next to it. Returns (and keeps) base_color, roughness, metallic, normal, environment, ground_colour."""
     o = surface_options(options)
     pixels = shots[0][0]
     with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
@@ -146,7 +147,10 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         if "hidden" not in options.without and moves is None:
             hidden = HiddenLight(traced, hidden_from(traced, cameras), traced.mesh.uvs[:, 0] < -0.5)
         fit_surface(bank, traced, model, o, stage, seed, hidden)
-        base, roughness, metallic = pictures(model.material)
+        names = ("base_color", "roughness", "metallic")
+        paint = {n: fill_gutters(t, known) for n, t in zip(names, pictures(model.material), strict=True)}
+        towards = [camera.with_pose(parts["poses"][i] @ parts["motions"][n]) for (_, camera), i, n in views_of_object(shots, parts)]
+        paint = painted_over(mesh, towards, paint, face, bary)
         environment = model.environment.image()
         ground = ground_level
         if len(parts["plane"]):
@@ -154,15 +158,19 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
             ground = ground_reflectance(environment, up, ground_level)
             environment = light_below(environment, up, ground_level)
         maps = {
-            "base_color": fill_gutters(base, known),
-            "roughness": fill_gutters(roughness, known),
-            "metallic": fill_gutters(metallic, known),
+            **paint,
             "normal": normal_map(model.material),
             "environment": environment,
             "ground_colour": ground,
         }
         stage.save("maps", **maps)
     return maps
+
+
+def views_of_object(shots, parts) -> list[tuple]:
+    """(shot, number of the instance, number of the photo) of all that is shown by photos that are related to the first."""
+    photos = parts["view_keys"] // ANOTHER_PHOTO
+    return [(shots[n], i, n) for i, n in zip(parts["view_instances"], photos, strict=True)]
 
 
 # ---------------------------------------------------------------- asset
