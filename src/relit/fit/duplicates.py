@@ -109,7 +109,8 @@ def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
 
 def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: DuplicatesOptions, seed: int) -> dict[str, np.ndarray]:
     """Material and light, in the scene frame: the world's axes, unit lengths of the object, the origin in the middle of the pile. What no
-    instance shows is painted like what is next to it. Returns (and keeps) base_color, roughness, metallic, normal, environment, ground_colour."""
+    instance shows is painted like what is next to it. Returns (and keeps) base_color, roughness, metallic, normal, environment and
+    ground_colour."""
     o = surface_options(options)
     pixels = shots[0][0]
     with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
