@@ -5,6 +5,7 @@ import pytest
 from volume_lump import photos_of, volume_lump
 
 from relit.cameras.se3 import camera_errors, exp_so3
+from relit.geometry.hull import NoShape
 
 pytest.importorskip("mitsuba")
 
@@ -69,12 +70,12 @@ def test_ways_that_fail_are_passed_over(crops, monkeypatch):
     from relit.fit import collection_few as few
 
     def fails():
-        raise ValueError("nothing in common")
+        raise NoShape("nothing in common")
 
     a = np.zeros((len(crops), 4, 4))
     monkeypatch.setattr(few, "misfit", lambda *_: 0.2)
     assert few.best_way(crops, {"no": fails, "yes": lambda: (a, np.ones(len(crops)))}, 0, quiet)[0] is a
-    with pytest.raises(ValueError, match="nothing in common"):
+    with pytest.raises(NoShape, match="nothing in common"):
         few.best_way(crops, {"no": fails}, 0, quiet)
 
 

@@ -42,6 +42,7 @@ from relit.fit.instances import (
 )
 from relit.fit.pile_scene import find_ground
 from relit.fit.register import crop_rings, directions_around, make_gallery, search, views_from
+from relit.geometry.hull import NoShape
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
@@ -275,7 +276,7 @@ def test_silhouettes_without_anything_in_common_are_left_as_they_are(monkeypatch
     from relit.fit import instance_search
 
     def nothing(*_, **__):
-        raise ValueError("the occupancy is empty or full")
+        raise NoShape("the occupancy is empty or full")
 
     views, truth = painted([0, 20, 40, 60])
     crops = crops_of(views)

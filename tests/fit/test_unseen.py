@@ -7,9 +7,12 @@ import trimesh
 from lump import cameras, lump
 
 from relit.asset.gltf import has_border
-from relit.fit.unseen import seen_faces, without_unseen
+from relit.cameras.se3 import look_at
+from relit.fit.duplicates import shown_faces
+from relit.fit.unseen import seen_faces, seen_points, without_unseen
 from relit.geometry.mesh import face_areas
 from relit.geometry.tangents import vertex_normals
+from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Mesh
 
 
@@ -59,3 +62,45 @@ def test_cameras_that_see_nothing_leave_the_mesh_as_it_is():
     mesh, _ = lump()
     away = [c.with_pose(c.world_from_camera @ np.diag([-1.0, 1.0, -1.0, 1.0])) for c in cameras()]
     assert without_unseen(mesh, away) is mesh
+
+
+def test_what_stands_behind_another_body_is_not_seen():
+    one = ball(0.4)
+    far = replace(one, vertices=one.vertices - np.float32([0, 0, 2]))
+    faces = np.concatenate([one.faces, far.faces + len(one.vertices)])
+    both = Mesh(np.concatenate([one.vertices, far.vertices]), faces, np.concatenate([one.normals] * 2))
+    before = cameras()[0].with_pose(look_at(np.array([0.0, 0.0, 2.1])))
+    seen = seen_faces(both, [before])
+    front = one.vertices[one.faces].mean(1)[:, 2] > 0.2
+    assert seen[: len(front)][front].all() and not seen[len(front) :].any()
+
+
+def test_aslant_is_seen_by_a_lower_cosine_alone():
+    mesh, eye = ball(0.6), np.array([0.0, 0.0, 2.1])
+    camera = cameras()[0].with_pose(look_at(eye))
+    to = eye - mesh.vertices
+    cosine = (mesh.normals * to).sum(1) / np.linalg.norm(to, axis=1)
+    scene = build_geometry(mesh)
+    for least in (0.0, 0.3):
+        seen = seen_points(scene, mesh.vertices, mesh.normals, [camera], least)
+        assert seen[cosine > least + 0.05].all() and not seen[cosine < least].any()
+
+
+def test_what_another_instance_hides_of_all_counts_as_unseen():
+    """Two instances, one straight behind the other: of the far one nothing is seen, of the near one its front; the ground counts not."""
+    one = ball(0.6)
+    far = one.vertices - np.float32([0, 0, 2])
+    square = np.float32([[-9, -0.7, -9], [9, -0.7, -9], [9, -0.7, 9], [-9, -0.7, 9]])
+    n = len(one.vertices)
+    ground = np.array([[0, 2, 1], [0, 3, 2]]) + 2 * n
+    vertices = np.concatenate([one.vertices, far, square])
+    uvs = np.concatenate([np.zeros((2 * n, 2)), np.full((4, 2), -1.5)])
+    normals = np.concatenate([one.normals, one.normals, np.tile(np.float32([0, 1, 0]), (4, 1))])
+    pile = Mesh(vertices, np.concatenate([one.faces, one.faces + n, ground]), normals, uvs)
+    front = cameras()[0].with_pose(look_at(np.array([0.0, 0.0, 2.1])))
+    middle = one.vertices[one.faces].mean(1)[:, 2]
+    seen = shown_faces(pile, 2, [front])
+    assert seen.shape == (len(one.faces),)
+    assert seen[middle > 0.3].all() and not seen[middle < 0.1].any()
+    back = cameras()[0].with_pose(look_at(np.array([0.0, 0.0, -4.1]), np.array([0.0, 0.0, -2.0])))
+    assert shown_faces(pile, 2, [front, back])[middle < -0.3].all()  # which the far one shows

@@ -29,6 +29,7 @@ def ball():
 
 def painted(mesh, cameras, red):
     """(textures before, after, positions (S, S, 3), known (S, S)) where base colour is `red` of each texel's place, and noise behind."""
+    from relit.fit.unseen import seen_faces
     from relit.fit.unseen_paint import painted_over
     from relit.geometry.bake import interpolate
 
@@ -38,7 +39,7 @@ def painted(mesh, cameras, red):
     behind = known & (at[..., 2] < -0.1)
     base[behind] = np.random.default_rng(0).uniform(0, 1, (int(behind.sum()), 3))
     before = {"base_color": fill_gutters(base, known), "roughness": fill_gutters(np.where(behind, 0.9, 0.3).astype(np.float32), known)}
-    return before, painted_over(mesh, cameras, before, face, bary), at, known
+    return before, painted_over(mesh, seen_faces(mesh, cameras), before, face, bary), at, known
 
 
 def test_back_is_continued_from_the_front(ball):
@@ -54,15 +55,14 @@ def test_back_is_continued_from_the_front(ball):
     assert top - bottom > 0.1, "what is above the rim is continued above, and what is below below"
 
 
-def test_nothing_changes_where_all_or_nothing_is_seen(ball, monkeypatch):
-    from relit.fit import unseen_paint
+def test_nothing_changes_where_all_or_nothing_is_seen(ball):
+    from relit.fit.unseen_paint import painted_over
 
     mesh, _ = ball
     face, bary = rasterise_atlas(mesh, SIZE)
     textures = {"base_color": np.random.default_rng(1).uniform(0, 1, (SIZE, SIZE, 3)).astype(np.float32)}
     for seen in (True, False):
-        monkeypatch.setattr(unseen_paint, "seen_faces", lambda *_, s=seen: np.full(len(mesh.faces), s))
-        assert unseen_paint.painted_over(mesh, [], textures, face, bary) is textures
+        assert painted_over(mesh, np.full(len(mesh.faces), seen), textures, face, bary) is textures
 
 
 def test_part_that_hangs_on_nothing_seen_takes_the_mean(ball):

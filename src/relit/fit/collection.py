@@ -34,10 +34,12 @@ from relit.fit.collection_shape import opened_stage, volume_stage
 from relit.fit.collection_surface import fit_collection_surface, light_family, light_options, posterior, start_collection_surface
 from relit.fit.pixels import PixelBank, place_cameras
 from relit.fit.surface import ALBEDO_START, SurfaceOptions
+from relit.fit.unseen import seen_faces
 from relit.fit.unseen_paint import painted_over
 from relit.fit.volume import VolumeModel
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
+from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.per_photo import COLUMNS, ROWS
@@ -108,7 +110,7 @@ def find_all(shots: list[Shot], groups: list[Group], degrees: float, run, option
         begun = None if "search" in without else poses_from_links(crops, groups, shots, hints, degrees, options.hypotheses, seed, run.say)
         args = (crops, hints, degrees, schedule, options.hypotheses, options.starts, without, seed, run.say, options.polish, begun)
         poses, scores = find_poses(*args, soft=options.lambda_c if options.assignment == "soft" else None)
-    except ValueError as error:
+    except NoShape as error:
         why = f"{error}: the masks belong to different objects, or are wrong"
         raise UserError("no shape agrees with the photos", why, "look at the masks (relit inspect)", code=4) from None
     linked = np.zeros(len(shots), bool) if begun is None else begun[2]
@@ -235,7 +237,7 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, albedo, tints, run, opti
         if silent:
             run.say(f"note: {silent} photos were all but silenced: the model does not explain them")
         paint = {"base_color": base, "roughness": roughness, "metallic": metallic}
-        paint = painted_over(mesh, cameras, {n: fill_gutters(t, known) for n, t in paint.items()}, face, bary)
+        paint = painted_over(mesh, seen_faces(mesh, cameras), {n: fill_gutters(t, known) for n, t in paint.items()}, face, bary)
         maps = {
             **paint,
             "normal": normal_map(model.material),

@@ -16,6 +16,7 @@ from relit.fit.collection_depth import depth_limit
 from relit.fit.collection_poses import Schedule, descended, gauge, polish, pose_towards, poses_from_hints
 from relit.fit.loop import NoStage
 from relit.fit.register import Crop
+from relit.geometry.hull import NoShape
 
 FEW = 24  # photos below which the ways are held against each other
 NODES, STEPS = 48, 200  # of the fit that tells
@@ -33,21 +34,21 @@ def misfit(crops: list[Crop], poses: np.ndarray, seed: int) -> float:
 
 
 def best_way(crops: list[Crop], ways: dict[str, Way], seed: int, say) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (P, 4, 4) and scores (P,) of the way with the least misfit, of those that are not BEHIND. Ways that raise ValueError are passed
-    over; raises ValueError when all do."""
+    """Poses (P, 4, 4) and scores (P,) of the way with the least misfit, of those that are not BEHIND. Ways that raise NoShape are passed
+    over; raises NoShape when all do."""
     found, failed = [], None
     for name, way in ways.items():
         try:
             poses, scores = way()
             wrong = misfit(crops, poses, seed)
-        except ValueError as error:
+        except NoShape as error:
             say(f"{name}: {error}")
             failed = error
             continue
         say(f"{name}: mean score {scores.mean():.3f}, misfit {wrong:.4f}")
         found.append((wrong, poses, scores))
     if not found:
-        raise failed or ValueError("there is no way")
+        raise failed or NoShape("there is no way")
     most = max(scores.mean() for *_, scores in found)
     return min((f for f in found if f[2].mean() >= most - BEHIND), key=lambda f: f[0])[1:]
 

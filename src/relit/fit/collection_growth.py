@@ -42,6 +42,7 @@ from relit.fit.register import (
     views_from,
     volume_render,
 )
+from relit.geometry.hull import NoShape
 from relit.rendering.shade_photos import shade_plain
 
 PARTS = (0.6, 1.0, 0.15, 0.3)  # of register.PARTS: without hints decoration tells more than what is dark and what is bright
@@ -207,7 +208,7 @@ def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
         tried.append((float(np.mean(np.sort(state[1])[-early[-1] :])), photo))
     score, best = max(tried)
     if score < HOPELESS:
-        raise ValueError(f"from none of {len(tried)} photos could a shape be grown that others agree with (best score {score:.2f})")
+        raise NoShape(f"from none of {len(tried)} photos could a shape be grown that others agree with (best score {score:.2f})")
     late = [min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2, 0.27, 0.37, 0.47, 0.57, 0.75, 1, 1, 1)]
     poses, scores = grow(crops, best, late, seed, say, rings)
     return settle(crops, poses, scores, rings, keep, seed, say)

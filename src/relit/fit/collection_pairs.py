@@ -16,6 +16,7 @@ from relit.conventions import similarity
 from relit.fit.collection_depth import inflated
 from relit.fit.collection_poses import coarse_model, distance_for, pose_towards
 from relit.fit.register import AHEAD, Crop, crop_views, directions_around, make_gallery, search, views_from, volume_render
+from relit.geometry.hull import NoShape
 
 FRONT = np.array([0.0, 0.0, 1.0])  # where the one photo of a rough solid looks from
 REACH = 57.0  # degrees from there up to which the solid is looked at
@@ -53,7 +54,7 @@ def pairs_of(crops: list[Crop], rings, parts, seed: int, nodes: int = 40) -> lis
         camera = crop_views([crops[i]], pose[None])[0]
         try:
             model = coarse_model([crops[i]], pose[None], nodes, 60, 0.4, seed, inflated(crops[i], camera, nodes, 1.0))
-        except ValueError:  # next to nothing is left of a thin silhouette
+        except NoShape:  # next to nothing is left of a thin silhouette
             continue
         found = search(crops, make_gallery(volume_render(model), views, parts), KEPT, rings=rings)
         scores[i], rotations[i] = found.scores, pose[:3, :3].T @ found.poses[..., :3, :3]

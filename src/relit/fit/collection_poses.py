@@ -37,7 +37,7 @@ from relit.fit.register import (
     volume_render,
 )
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
-from relit.geometry.hull import distance_of, visual_hull
+from relit.geometry.hull import NoShape, distance_of, visual_hull
 from relit.rendering.shade_photos import shade_photos, shade_plain, start_photo_lights
 from relit.scene import Camera
 
@@ -106,17 +106,17 @@ def gauge(crops: list[Crop], poses: np.ndarray) -> np.ndarray:
 
 
 def hull_by_vote(cameras: list[Camera], masks: list[np.ndarray], nodes: int, tolerance: float, limit=None) -> np.ndarray:
-    """(n, n, n) distances of the hull at the tolerance, or at a larger one where that is next to empty. Raises ValueError when all are."""
+    """(n, n, n) distances of the hull at the tolerance, or at a larger one where that is next to empty. Raises NoShape when all are."""
     for more in (tolerance, 0.5 * (tolerance + 0.6), 0.6, 0.75):
         try:
             values = visual_hull(cameras, masks, nodes, tolerance=more)
             if limit is not None:
                 values = distance_of((values < 0) & limit)
-        except ValueError:
+        except NoShape:
             continue
         if (values < 0).sum() > 50:
             return values
-    raise ValueError("the silhouettes have nothing in common")
+    raise NoShape("the silhouettes have nothing in common")
 
 
 def coarse_model(crops: list[Crop], poses, nodes: int, steps: int, tolerance: float, seed: int, limit=None, shares=None) -> VolumeModel:

@@ -18,7 +18,7 @@ from relit.fit.hollows import without
 from relit.fit.lids import FIRST, PHOTOS, open_lids
 from relit.fit.pixels import PixelBank, corrected, make_bank, place_cameras
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, next_level, restore_model, start_model
-from relit.geometry.hull import distance_of, visual_hull
+from relit.geometry.hull import NoShape, distance_of, visual_hull
 from relit.rendering.shade_photos import shade_photos, start_photo_lights
 from relit.run import run_arrays
 from relit.scene import Camera
@@ -99,7 +99,7 @@ def hull_of(cameras: list[Camera], masks: list[np.ndarray], nodes: int) -> np.nd
     for tolerance in (0.1, 0.2, 0.35, 0.5):
         try:
             values = visual_hull(cameras, masks, nodes, tolerance=tolerance)
-        except ValueError:
+        except NoShape:
             continue
         if (values < 0).sum() > 100:
             return values

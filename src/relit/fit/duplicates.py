@@ -38,12 +38,13 @@ from relit.fit.pile_scene import (
     spread,
 )
 from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
+from relit.fit.unseen import seen_faces
 from relit.fit.unseen_paint import painted_over
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.mesh import vertex_areas
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
-from relit.rendering.transport import TraceableMesh
+from relit.rendering.transport import NO_TEXELS, TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 from relit.settings import check_levels
@@ -120,7 +121,10 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         scene_from_photo = similarity(turn, -turn @ middle)
         ground_level = ground_colour(pixels, parts["plane"])
         moves = spread(standing, scene_from_photo) if "visibility" in options.without else None
-        whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, moves)
+        pile, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera)
+        whole = pile
+        if moves is not None:
+            whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, moves)
         numbers = np.flatnonzero(parts["related"])
         used, cameras = [shots[n][0] for n in numbers], [shots[n][1].with_pose(scene_from_photo @ parts["motions"][n]) for n in numbers]
         keys = parts["view_keys"]
@@ -144,14 +148,13 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         model = start_surface(start, known, level, o, None, metallic, roughness)
         if options.gaussians:
             model.gaussians = GaussianLight(options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START)
-        hidden = None
+        gathered = None
         if "hidden" not in options.without and moves is None:
-            hidden = HiddenLight(traced, hidden_from(traced, cameras), traced.mesh.uvs[:, 0] < -0.5)
-        fit_surface(bank, traced, model, o, stage, seed, hidden)
+            gathered = HiddenLight(traced, hidden_from(traced, cameras), traced.mesh.uvs[:, 0] < NO_TEXELS).before
+        fit_surface(bank, traced, model, o, stage, seed, gathered)
         names = ("base_color", "roughness", "metallic")
         paint = {n: fill_gutters(t, known) for n, t in zip(names, pictures(model.material), strict=True)}
-        towards = [camera.with_pose(parts["poses"][i] @ parts["motions"][n]) for (_, camera), i, n in views_of_object(shots, parts)]
-        paint = painted_over(mesh, towards, paint, face, bary)
+        paint = painted_over(mesh, shown_faces(pile, len(standing), cameras), paint, face, bary)
         environment = model.environment.image()
         ground = ground_level
         if len(parts["plane"]):
@@ -168,10 +171,11 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
     return maps
 
 
-def views_of_object(shots, parts) -> list[tuple]:
-    """(shot, number of the instance, number of the photo) of all that is shown by photos that are related to the first."""
-    photos = parts["view_keys"] // ANOTHER_PHOTO
-    return [(shots[n], i, n) for i, n in zip(parts["view_instances"], photos, strict=True)]
+def shown_faces(pile: Mesh, count: int, cameras: list[Camera]) -> np.ndarray:
+    """(F,) bool: faces of the object that some camera sees on one of the `count` instances, which come first in the pile."""
+    seen = seen_faces(pile, cameras)
+    instances = (pile.uvs[pile.faces[:, 0], 0] > NO_TEXELS).sum()
+    return seen[:instances].reshape(count, -1).any(0)
 
 
 # ---------------------------------------------------------------- asset

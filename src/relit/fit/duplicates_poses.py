@@ -18,6 +18,7 @@ from relit.fit.instance_growth import seen_from
 from relit.fit.instance_search import Search, ambiguous
 from relit.fit.instance_trials import place_few
 from relit.fit.instances import COARSE, View, carved, views_of
+from relit.geometry.hull import NoShape
 from relit.run import run_arrays
 from relit.scene import Camera, Pixels
 
@@ -49,7 +50,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
         search = Search(rounds=options.search_rounds, **({"descents": 0} if "refinement" in options.without else {}))
         try:
             poses, scores = place_few(views, search, seed=seed, links=matched.told if matched else (), say=run.say)
-        except ValueError:
+        except NoShape:
             raise UserError(
                 "no poses of the instances fit together",
                 "the objects are not identical, the labels are wrong, or too few are seen from near-by sides",

@@ -23,6 +23,7 @@ from relit.fit.pixels import PixelBank
 from relit.fit.sought_again import sought_again
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
+from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
@@ -140,7 +141,7 @@ def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: D
     inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
     try:
         values = carved(views, poses, options.levels[0], 0.15, Search.depth, crossed=True)
-    except ValueError:
+    except NoShape:
         raise UserError(
             "the silhouettes have nothing in common",
             "poses are wrong, or the objects differ",

@@ -35,7 +35,7 @@ from relit.fit.placing import placed_mesh
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.hull import visual_hull
+from relit.geometry.hull import NoShape, visual_hull
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.masks.threshold import Backdrop
@@ -216,7 +216,7 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, coat: Coa
     with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
         try:
             values = visual_hull(cameras, masks, options.levels[0])
-        except ValueError:
+        except NoShape:
             raise UserError(
                 "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
                 "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",

@@ -16,16 +16,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.fit.unseen import seen_points
 from relit.lighting.environment import Environment
 from relit.materials.brdf import Surface
 from relit.materials.field import MaterialField, material_at
-from relit.rendering.transport import OFFSET, Points, TraceableMesh, reflected, sample_lights
+from relit.rendering.transport import Points, TraceableMesh, reflected, sample_lights
 from relit.scene import Camera
 
 AT = (0.0, 0.1, 0.25, 0.5, 0.75)  # shares of the pass at which it is gathered
 BOUNCES = 2  # gatherings at a time: what is hidden lights what is hidden
 DIRECTIONS = 32
 CHUNK = 1 << 15  # vertices at once
+ASLANT = 0.1  # cosine under which what a photo shows of a surface is not trusted
 
 
 @dataclass
@@ -39,9 +41,10 @@ class HiddenLight:
     def __post_init__(self):
         self._vertices = mi.Float(np.ascontiguousarray(self.mesh.mesh.vertices, np.float32).ravel())
 
-    def due(self, step: int, steps: int) -> bool:
-        """Whether it is to be gathered before this step."""
-        return step in {int(a * steps) for a in AT}
+    def before(self, step: int, steps: int, material: MaterialField, environment: Environment, seed: int) -> None:
+        """Gather it where it is due before this step of so many."""
+        if step in {int(a * steps) for a in AT}:
+            self.gather(material, environment, seed + step)
 
     def gather(self, material: MaterialField, environment: Environment, seed: int) -> None:
         """Replace the radiance of the hidden vertices by what they reflect under `environment`."""
@@ -82,16 +85,5 @@ class HiddenLight:
 
 
 def hidden_from(mesh: TraceableMesh, cameras: list[Camera]) -> np.ndarray:
-    """(V,) bool: vertices that none of the cameras sees."""
-    vertices, normals = (np.asarray(a, np.float32) for a in (mesh.mesh.vertices, mesh.mesh.normals))
-    seen = np.zeros(len(vertices), bool)
-    for camera in cameras:
-        q = camera.project(vertices)
-        inside = (q[:, 0] >= 0) & (q[:, 0] < camera.width) & (q[:, 1] >= 0) & (q[:, 1] < camera.height) & (q[:, 2] > 0)
-        to = camera.centre - vertices
-        far = np.linalg.norm(to, axis=1)
-        inside &= (normals * to).sum(1) > 0.1 * far
-        ray = mi.Ray3f(mi.Point3f((vertices + OFFSET * normals).T), mi.Vector3f((to / far[:, None]).astype(np.float32).T))
-        ray.maxt = mi.Float(far.astype(np.float32))
-        seen |= inside & ~np.array(mesh.scene.ray_test(ray))
-    return ~seen
+    """(V,) bool: vertices that none of the cameras sees, or only aslant."""
+    return ~seen_points(mesh.scene, mesh.mesh.vertices, mesh.mesh.normals, cameras, ASLANT)

@@ -45,7 +45,7 @@ def grow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (N, 4, 4) and scores (N,) of all instances, grown from `members`, whose entries of `poses` count.
 
-    links: ((i, j, rotation of i onto j in the photo), ...) from matching, tried beside the guesses of the search. Raises ValueError where
+    links: ((i, j, rotation of i onto j in the photo), ...) from matching, tried beside the guesses of the search. Raises NoShape where
     the silhouettes of the members have nothing in common.
     """
     poses, scores = np.array(poses, np.float64), np.full(len(views), -1.0)

@@ -27,6 +27,7 @@ from relit.fit.register import (
     search,
     views_from,
 )
+from relit.geometry.hull import NoShape
 
 # weights in fit.register's descriptors: one photo, one light, so brightness tells more than across photos; colourful objects do with less
 # of it; whether another pose would do as well is judged in detail
@@ -231,7 +232,7 @@ def regrown(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=P
             if better.mean() <= own.mean():
                 break
             poses, scores, own = again, level, better
-    except ValueError:  # the silhouettes have nothing in common
+    except NoShape:  # those that are left have nothing in common: it was not they
         pass
     return poses, scores
 
@@ -278,7 +279,7 @@ def trusted(scores: np.ndarray, gap: float = GAP) -> np.ndarray:
 def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None, step=lambda done, total: None):
     """Poses (N, 4, 4) object_from_camera of all views and their scores (N,), from nothing but the photo and its labels.
 
-    links: ((i, j, rotation of i onto j in the photo), ...) from matching: growth tries them beside its own guesses. Raises ValueError where
+    links: ((i, j, rotation of i onto j in the photo), ...) from matching: growth tries them beside its own guesses. Raises NoShape where
     no set of poses agrees with the silhouettes.
     """
     distance = frame_scale(views)
@@ -301,7 +302,7 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
             poses[pair] = guesses[parts].poses[s, pair, 0]
             try:
                 poses, scores = grow(views, crops, rings[parts], parts, pair, poses, o.growth, seed=seed, links=links)
-            except ValueError:  # the silhouettes have nothing in common
+            except NoShape:  # the silhouettes have nothing in common
                 continue
             # scores of different descriptors compare by how far they stand above chance
             skill = float((scores.mean() - guesses[parts].chance) / max(1 - guesses[parts].chance, 1e-3))
@@ -309,7 +310,7 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
             if best is None or skill > best[0]:
                 best = skill, poses, scores, parts
     if best is None:
-        raise ValueError("no set of poses agrees with the silhouettes")
+        raise NoShape("no set of poses agrees with the silhouettes")
     skill, poses, scores, parts = best
     if skill < o.convincing:
         say(f"note: the poses are uncertain, {skill:.2f} above chance where {o.convincing:.2f} convinces: is the object nearly symmetric?")

@@ -12,6 +12,7 @@ import numpy as np
 from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_search import Search, model_of_all, place
 from relit.fit.instances import View
+from relit.geometry.hull import NoShape
 
 FEW = 8  # objects up to which one search is not enough
 TRIALS = 3
@@ -19,14 +20,14 @@ SAME = 15.0  # degrees within which two searches have put all objects alike
 
 
 def place_few(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None) -> tuple[np.ndarray, np.ndarray]:
-    """`place`, for few objects several times: poses (N, 4, 4) and scores (N,). Raises ValueError as that where every search fails."""
+    """`place`, for few objects several times: poses (N, 4, 4) and scores (N,). Raises NoShape as that where every search fails."""
     if not 2 < len(views) <= FEW or not o.descents:
         return place(views, o, seed=seed, links=links, say=say)
     found: list[tuple[float, np.ndarray, np.ndarray]] = []
     for trial in range(TRIALS):
         try:
             poses, scores = place(views, o, seed=seed + 1000 * trial, links=links, say=say)
-        except ValueError:
+        except NoShape:
             if trial == TRIALS - 1 and not found:
                 raise
             continue

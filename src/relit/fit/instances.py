@@ -160,7 +160,7 @@ def carved(
     views: list[View], poses: np.ndarray, n: int, tolerance: float, depth: float | None = None, *, crossed: bool = False
 ) -> np.ndarray:
     """Signed distance of what lies inside nearly all silhouettes: a node is out where more than `tolerance` of the views that know show
-    background there. Raises ValueError when nothing is left.
+    background there. Raises NoShape when nothing is left.
 
     depth: a view also counts a node as out that lies farther before or behind the object's middle than `depth` times the distance to the
     outline, and a little: views from nearly one side would leave a body as deep as the ball. crossed: poses are good enough that a view

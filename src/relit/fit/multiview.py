@@ -34,7 +34,7 @@ from relit.fit.unseen import without_unseen
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.hull import visual_hull
+from relit.geometry.hull import NoShape, visual_hull
 from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.materials.field import normal_map, pictures
@@ -214,7 +214,7 @@ def volume_stage(bank: PixelBank, cameras: list[Camera], masks, level, run, opti
         if masks is not None:
             try:
                 values = visual_hull(cameras, masks, n)
-            except ValueError:
+            except NoShape:
                 raise UserError(
                     "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
                     "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",

@@ -27,6 +27,7 @@ from relit.cameras.se3 import exp_so3, look_at, rotation_angle, rotation_from
 from relit.conventions import similarity
 from relit.fit.pixels import RayBatch, camera_rows, rays_through
 from relit.fit.volume import VolumeModel
+from relit.geometry.hull import NoShape
 from relit.rendering.march import march, sphere_interval
 from relit.scene import Camera
 
@@ -97,11 +98,11 @@ def crop_photo(rgb: np.ndarray, mask: np.ndarray, camera: Camera, weight: np.nda
     """Look at the object of a photo with a camera of its own: turned to the silhouette's centre, so that a wide photo's stretching off its
     middle is gone, and zoomed to REACH spreads of the silhouette.
 
-    rgb: (H, W, 3) linear, mask: (H, W), weight: (H, W) or None (all known). camera: intrinsics only. Raises ValueError for an empty mask.
+    rgb: (H, W, 3) linear, mask: (H, W), weight: (H, W) or None (all known). camera: intrinsics only. Raises NoShape for an empty mask.
     """
     known = mask if weight is None else mask * weight
     if not known.sum() > 1:
-        raise ValueError("the mask is empty")
+        raise NoShape("the mask is empty")
     centre, spread = (a[0] for a in moments(known[None]))
     u, v = centre
     ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])

@@ -15,7 +15,6 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.exchange import REFRESH, Exchange
-from relit.fit.hidden_light import HiddenLight
 from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels, saturated_at
@@ -131,10 +130,10 @@ def fit_surface(
     options: SurfaceOptions,
     stage,
     seed: int = 0,
-    hidden: HiddenLight | None = None,
+    before=None,
 ) -> SurfaceModel:
-    """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when there is one. hidden: keeps the radiance
-    of what no photo shows up to date."""
+    """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when there is one. before(step,
+    steps, material, environment, seed): called before each step; it may change the mesh's radiance."""
     material, environment, gaussians = model.material, model.environment, model.gaussians
     first = 0
     saved = stage.load("checkpoint")
@@ -146,7 +145,7 @@ def fit_surface(
             model.log_light = mi.Float(saved["light"])
         else:
             gaussians.parameters = mi.Float(saved["light"])
-    if saved and hidden is not None:
+    if saved and before is not None:
         mesh.radiance = mi.Float(saved["radiance"])
     if gaussians is not None:
         model.log_light = gaussians.log_radiance()
@@ -168,8 +167,8 @@ def fit_surface(
     def step(i: int) -> dict:
         decay = cosine_decay(i / options.steps, 0.05)
         warm = min(1.0, 0.05 + (i / (options.warm * light_steps)) ** 2)  # the light first: base colour could explain all shading at once
-        if hidden is not None and hidden.due(i, options.steps):
-            hidden.gather(material, environment, seed + i)
+        if before is not None:
+            before(i, options.steps, material, environment, seed)
         batch, points = drawn_points(bank, mesh, rng, count)
         valid = points.valid
         near = neighbours(mesh, points, options.similarity_reach, rng)
@@ -242,7 +241,7 @@ def fit_surface(
         names = {"colour": material.colour, "metallic": material.metallic, "slope": material.slope, "light": light_parameters(model)}
         arrays = {name: np.array(value) for name, value in {**names, "metal": model.metal}.items()}
         followed = {} if exchange.light is None else {"followed": np.array(exchange.light)}
-        followed |= {} if hidden is None else {"radiance": np.array(mesh.radiance)}
+        followed |= {} if before is None else {"radiance": np.array(mesh.radiance)}
         return arrays | followed | memory(rng, adam)
 
     def textures(uv, valid):

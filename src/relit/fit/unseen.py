@@ -7,19 +7,17 @@ between seen faces stay filled.
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from relit.fit.pixels import camera_rows, rays_through
 from relit.geometry.mesh import KEEP, face_areas
 from relit.geometry.tangents import edges
 from relit.rendering.mitsuba_scene import build_geometry
+from relit.rendering.transport import OFFSET
 from relit.scene import Camera, Mesh
 
-PIXELS = 160_000  # rays through each photo, about
 FILLED = 0.01  # of the mesh's area: unseen parts smaller than this stay
 RIM = 2  # rings of unseen faces beside seen ones that stay
 
@@ -42,21 +40,31 @@ def without_unseen(mesh: Mesh, cameras: list[Camera]) -> Mesh:
 
 
 def seen_faces(mesh: Mesh, cameras: list[Camera]) -> np.ndarray:
-    """(F,) bool: faces that some camera sees from outside."""
-    scene, seen = build_geometry(mesh), np.zeros(len(mesh.faces), bool)
-    rows = mi.Float(camera_rows(cameras))
-    for view, camera in enumerate(cameras):
-        scale = np.sqrt(PIXELS / (camera.width * camera.height))  # small photos: several rays a pixel, so that each face is met
-        w, h = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
-        index = dr.arange(mi.UInt32, w * h)
-        step = dr.opaque(mi.Float, camera.width / w), dr.opaque(mi.Float, camera.height / h)
-        row = index // dr.opaque(mi.UInt32, w)
-        x, y = (mi.Float(index - row * dr.opaque(mi.UInt32, w)) + 0.5) * step[0], (mi.Float(row) + 0.5) * step[1]
-        o, d = rays_through(rows, dr.opaque(mi.UInt32, view, w * h), x, y)
-        ray = mi.Ray3f(mi.Point3f(o), d)
-        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-        front = np.array(si.is_valid() & (dr.dot(si.n, d) < 0))
-        seen[np.array(si.prim_index)[front]] = True
+    """(F,) bool: faces that some camera sees from outside, in their middle or near one of their corners."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    points = np.concatenate([corners.mean(1, keepdims=True), 0.7 * corners + 0.3 * corners.mean(1, keepdims=True)], 1)
+    seen = seen_points(build_geometry(mesh), points.reshape(-1, 3), np.repeat(normals, 4, axis=0), cameras)
+    return seen.reshape(-1, 4).any(1)
+
+
+def seen_points(scene: mi.Scene, points: np.ndarray, normals: np.ndarray, cameras: list[Camera], cosine: float = 0.0) -> np.ndarray:
+    """(N,) bool: points (N, 3) of the scene's surface, with unit normals (N, 3), that some camera sees under a cosine above `cosine`."""
+    seen = np.zeros(len(points), bool)
+    for camera in cameras:
+        x, y, depth = camera.project(points).T
+        to = camera.centre - points
+        far = np.linalg.norm(to, axis=1)
+        shown = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height) & ((normals * to).sum(1) > cosine * far)
+        asked = np.flatnonzero(shown & ~seen)
+        if len(asked) == 0:
+            continue
+        # width varies from camera to camera, which compiles nothing: launches of any width share a kernel
+        o, d = (points + OFFSET * normals)[asked], to[asked] / far[asked, None]
+        ray = mi.Ray3f(mi.Point3f(o.astype(np.float32).T), mi.Vector3f(d.astype(np.float32).T))
+        ray.maxt = mi.Float(far[asked].astype(np.float32))
+        seen[asked] = ~np.array(scene.ray_test(ray))
     return seen
 
 

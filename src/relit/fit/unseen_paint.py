@@ -10,18 +10,16 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
-from relit.fit.unseen import seen_faces
 from relit.geometry.bake import fill_gutters, interpolate
 from relit.geometry.tangents import edges
-from relit.scene import Camera, Mesh
+from relit.scene import Mesh
 
 LEAK = 1e-6  # pull to the mean of what is seen: parts that hang on nothing seen take it
 
 
-def painted_over(mesh: Mesh, cameras: list[Camera], textures: dict[str, np.ndarray], face: np.ndarray, bary: np.ndarray):
-    """The textures, {name: (S, S) or (S, S, C)}, with the texels of faces that no camera sees continued from those that are seen; as they
-    are where all or nothing is seen. mesh, cameras: unit frame. face, bary: of `geometry.bake.rasterise_atlas`."""
-    seen = seen_faces(mesh, cameras)
+def painted_over(mesh: Mesh, seen: np.ndarray, textures: dict[str, np.ndarray], face: np.ndarray, bary: np.ndarray):
+    """The textures, {name: (S, S) or (S, S, C)}, with the texels of faces that are not seen continued from those that are; as they are
+    where all or nothing is seen. seen: (F,) bool. face, bary: of `geometry.bake.rasterise_atlas`."""
     if seen.all() or not seen.any():
         return textures
     names, sizes = list(textures), [t[0, 0].size for t in textures.values()]

@@ -11,6 +11,10 @@ from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
 
+class NoShape(ValueError):
+    """Silhouettes, in the poses given, leave no shape."""
+
+
 def visual_hull(cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, *, tolerance: float = 1 / 30) -> np.ndarray:
     """Signed distance (n, n, n) float32 [z, y, x] of the visual hull over [-1, 1]^3.
 
@@ -39,5 +43,5 @@ def distance_of(inside: np.ndarray) -> np.ndarray:
     """Signed distance (n, n, n) of an occupancy grid over [-1, 1]^3, negative inside."""
     h = 2.0 / (inside.shape[0] - 1)
     if not inside.any() or inside.all():
-        raise ValueError("the occupancy is empty or full")
+        raise NoShape("the occupancy is empty or full")
     return ((distance_transform_edt(~inside) - distance_transform_edt(inside)) * h).astype(np.float32)

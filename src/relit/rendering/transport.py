@@ -24,11 +24,12 @@ from relit.rendering.path import SmoothOrigins
 from relit.scene import Mesh
 
 OFFSET = 1e-3  # of the unit frame, along the normal
+NO_TEXELS = -0.5  # texture coordinates below are those of faces without texels
 
 
 class TraceableMesh:
-    """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray queries. Faces whose uvs are below -.5
-    carry no texels: they only block (the ground of a photo of duplicates)."""
+    """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray queries. Faces whose uvs are below
+    NO_TEXELS carry none: they only block (the ground of a photo of duplicates)."""
 
     def __init__(self, mesh: Mesh, radiance: np.ndarray):
         self.mesh, self.scene = mesh, build_geometry(mesh)
@@ -75,7 +76,7 @@ def first_hits(mesh: TraceableMesh, o, d) -> Points:
         along = dr.select(hit & (length > 1e-6), along / dr.maximum(length, 1e-6), mi.Frame3f(n).s)
         across = dr.select(t.w < 0, -1.0, 1.0) * dr.cross(n, along)
         geometric = dr.select(hit, mi.Vector3f(si.n), mi.Vector3f(0, 0, 1))
-        seen = hit & (dr.dot(si.n, d) < 0) & (uv.x > -0.5)
+        seen = hit & (dr.dot(si.n, d) < 0) & (uv.x > NO_TEXELS)
         return Points(seen, x, n, geometric, -mi.Vector3f(d), uv, along, across)
 
 
