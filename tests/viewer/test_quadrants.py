@@ -2,17 +2,20 @@
 
 import json
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
+from looking import serve
 
 from relit.capture import open_capture
 from relit.capture.samurai import direction_of, quadrant_of, read_hints
 from relit.errors import UserError
 from relit.images import write_srgb
+from relit.viewer import quadrants
 from relit.viewer.quadrants import answers_of, ask_in_terminal, guesses_of, keys_of, quadrant_server
 
 
@@ -101,3 +104,51 @@ def test_page(capture):
     finally:
         server.shutdown()
         server.server_close()
+
+
+def test_answering_in_a_browser(drive, capture, monkeypatch):
+    """By keys; a photo that takes long to load shows nothing until it is there, and never the one before."""
+    encode = quadrants.encode_jpeg
+    monkeypatch.setattr(quadrants, "encode_jpeg", lambda rgb: (time.sleep(0.8), encode(rgb))[1])
+    server = serve(lambda: quadrants.quadrant_server(capture))
+    shown = "(() => { const p = document.getElementById('photo'); return [p.getAttribute('src'), p.complete && p.naturalWidth]; })()"
+    there = {"wait": "document.getElementById('photo').naturalWidth === 30"}
+    try:
+        results = drive(
+            server.url,
+            [
+                {"wait": "typeof photos !== 'undefined' && photos.length === 3"},
+                {"eval": shown},
+                there,
+                {"press": "d"},
+                {"press": "w"},
+                {"press": "Enter"},
+                {"wait": "photos[0].answer"},
+                {"eval": shown},
+                there,
+                {"press": "a"},
+                {"press": "d"},  # the other side of an axis takes its place
+                {"press": "b"},
+                {"press": "Enter"},
+                {"wait": "photos[1].answer"},
+                there,
+                {"press": "Enter"},  # nothing chosen
+                {"wait": "document.getElementById('note').textContent !== ''"},
+                {"press": "f"},
+                {"press": "Enter"},
+                {"wait": "photos[2].answer"},
+                {"eval": "document.getElementById('note').textContent"},
+                {"press": "ArrowLeft"},
+                {"eval": shown},
+            ],
+            errors_allowed=True,  # the refused answer
+        )
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert results[0][0] == "photo.jpg?i=0" and not results[0][1]
+    assert results[1][0] == "photo.jpg?i=1" and not results[1][1]
+    assert results[2].startswith("All answered")
+    assert results[3] == ["photo.jpg?i=1", 30], "a photo that was there is there at once"
+    answers = json.loads((capture.folder / "quadrants.json").read_text())["frames"]
+    assert [f["quadrant"] for f in answers] == [["Right", "Above", "Center"], ["Right", "Center", "Back"], ["Center", "Center", "Front"]]

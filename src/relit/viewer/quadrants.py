@@ -141,10 +141,10 @@ def quadrant_server(capture: Capture, port: int = 0, guesses: Mapping[str, list[
     return server
 
 
-PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Quadrants</title>
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Quadrants</title><link rel="icon" href="data:,">
 <style>
 body { margin: 0; font: 16px/1.4 system-ui, sans-serif; background: #1b1d20; color: #e8e8e8; text-align: center }
-img { max-width: 96vw; max-height: 66vh; margin: 1em auto; display: block }
+img { max-width: 96vw; max-height: 66vh; min-height: 8em; margin: 1em auto; display: block }
 button { font: inherit; margin: .2em; padding: .4em .9em; border: 1px solid #777; border-radius: .4em; background: #2b2e33; color: inherit }
 button[aria-pressed=true] { background: #3a6ea5; border-color: #9cf }
 #note { min-height: 1.5em; color: #fc8 }
@@ -169,11 +169,17 @@ function toggle(key) {
 function draw() {
   for (const b of $("keys").children) b.setAttribute("aria-pressed", chosen.has(b.dataset.key));
 }
+function picture(i) {  // one element each: while a photo loads, no other stands in its place
+  if (!photos[i].image) photos[i].image = Object.assign(new Image(), {id: "photo", alt: "loading", src: "photo.jpg?i=" + i});
+  return photos[i].image;
+}
 function show(i) {
   at = Math.max(0, Math.min(photos.length - 1, i));
   const p = photos[at];
   chosen = new Set(Object.keys(keys).filter(k => (p.answer || p.guess || []).includes(keys[k])));
-  $("photo").src = "photo.jpg?i=" + at;
+  $("photo").replaceWith(picture(at));
+  const following = at + 1;
+  if (following < photos.length) picture(at).decode().catch(() => {}).then(() => picture(following));
   const done = photos.filter(q => q.answer).length;
   const where = (at + 1) + " of " + photos.length + ", " + done + " answered", hint = !p.answer && p.guess ? " (a guess is shown)" : "";
   $("what").textContent = p.name + " (" + where + "): where did the camera stand?" + hint;

@@ -138,7 +138,10 @@ class Handler(BaseHTTPRequestHandler):
     def _send(self, body: bytes, kind: str, code: HTTPStatus = HTTPStatus.OK) -> None:
         self._head(kind, len(body), code)
         if self.command != "HEAD":
-            self.wfile.write(body)
+            try:
+                self.wfile.write(body)
+            except OSError:  # the page has gone
+                self.close_connection = True
 
     def _head(self, kind: str, size: int, code: HTTPStatus = HTTPStatus.OK) -> None:
         self.send_response(code)
