@@ -150,6 +150,7 @@ class Stage:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.earlier = float((read_json(self.folder / "time.json") or {}).get("seconds", 0.0))  # of stopped processes
         self._begun = self._saved = time.monotonic()
+        self._unreadable: set[str] = set()  # what was said of them is not said again
         self._written = -math.inf
         self._interval = CHECKPOINT_SECONDS
         self._shown = time.monotonic()
@@ -200,7 +201,9 @@ class Stage:
         try:
             return load_arrays(path)
         except NO_ARRAYS as error:
-            self.run.say(f"checkpoint {name} of stage {self.name} cannot be read and is left out ({type(error).__name__}): {path}")
+            if name not in self._unreadable:
+                self.run.say(f"note: {path} cannot be read ({type(error).__name__}) and is left out")
+                self._unreadable.add(name)
             return None
 
     def preview_due(self) -> bool:
