@@ -8,6 +8,7 @@ from relit.conventions import similarity
 from relit.fit import instance_trials
 from relit.fit.instance_search import Search
 from relit.fit.instance_trials import SAME, place_few, turned_apart
+from relit.geometry.hull import NoShape
 
 
 def poses(seed, count=6):
@@ -66,10 +67,12 @@ def test_where_none_agree_the_best_is_taken_and_said(search):
 
 
 def test_a_search_that_fails_is_no_end(search):
-    got, said, seeds = search([ValueError("nothing"), poses(1), ValueError("nothing")], [0.95])
+    got, said, seeds = search([NoShape("nothing"), poses(1), NoShape("nothing")], [0.95])
     assert np.array_equal(got, poses(1)) and len(seeds) == 3 and "no two of 3 searches" in said[-1]
-    with pytest.raises(ValueError, match="nothing"):
-        search([ValueError("nothing")] * 3, [])
+    with pytest.raises(NoShape, match="nothing"):
+        search([NoShape("nothing")] * 3, [])
+    with pytest.raises(TypeError, match="a fault"):  # only that there is no shape is passed over
+        search([TypeError("a fault"), poses(1), poses(1)], [])
 
 
 def test_many_objects_and_two_are_searched_for_once(search):

@@ -100,6 +100,30 @@ def test_a_ball_comes_back(capture_folder, tmp_path):
     assert 0.03 < second[24:40, 88:104].mean() < 1 and second[24:40, 152:168].std(-1).max() < 0.05
 
 
+def test_what_no_photo_shows_is_painted_like_what_is_next_to_it(capture_folder, tmp_path, monkeypatch):
+    from relit.fit import multiview
+
+    whole = open_capture(capture_folder)
+    capture = replace(whole, photos=whole.photos[:5])  # from above
+    raw, paint = {}, multiview.painted_over
+
+    def recording(mesh, seen, maps, face, bary):
+        raw.update(maps, seen=(face >= 0) & seen[face], hidden=(face >= 0) & ~seen[face])
+        return paint(mesh, seen, maps, face, bary)
+
+    monkeypatch.setattr(multiview, "painted_over", recording)
+    with Run.open(tmp_path, {}) as run:
+        material = reconstruct(capture, run, TINY, 0).material
+    shown, hidden = raw["seen"], raw["hidden"]
+    assert 0.1 < hidden.sum() / (hidden | shown).sum() < 0.7
+    for name, changes in (("base_color", 0.02), ("roughness", 0), ("metallic", 0)):
+        before, after = raw[name], getattr(material, name)
+        np.testing.assert_array_equal(after[shown], before[shown])
+        lowest, highest = before[shown].min(0), before[shown].max(0)  # a corner of a shown face may lie on a texel of the next face
+        assert (after[hidden] > lowest - 0.05).all() and (after[hidden] < highest + 0.05).all()
+        assert np.abs(after - before)[hidden].mean() > changes, "the pass alone leaves something else there"
+
+
 def test_it_goes_on_from_a_checkpoint(capture_folder, tmp_path, monkeypatch):
     """A stop in the second level, then the same call: the steps before the checkpoint are not done again, and the result is as good."""
     import relit.fit.volume as volume

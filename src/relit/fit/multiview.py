@@ -30,7 +30,8 @@ from relit.fit.outlines import follow_outlines
 from relit.fit.pixels import PixelBank, corrected, place_cameras, sphere_pixels
 from relit.fit.placing import placed_mesh
 from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
-from relit.fit.unseen import without_unseen
+from relit.fit.unseen import seen_faces, without_unseen
+from relit.fit.unseen_paint import painted_over
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, render_views, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -170,7 +171,7 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
     else:
-        maps = surface_stage(bank, mesh, parts["radiance"], run, options, seed)
+        maps = surface_stage(bank, cameras, mesh, parts["radiance"], run, options, seed)
     poses = [move_pose(capture.sphere.world_from_unit, c.world_from_camera) for c in cameras] if options.refine_cameras > 0 else None
     return assemble(capture, mesh, maps, poses)
 
@@ -297,8 +298,9 @@ def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: M
     return parts
 
 
-def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, options: MultiviewOptions, seed: int) -> dict[str, np.ndarray]:
-    """Material and light. Returns (and keeps) base_color, roughness, metallic, environment (unit frame), f0."""
+def surface_stage(bank: PixelBank, cameras, mesh: Mesh, radiance, run, options: MultiviewOptions, seed: int) -> dict[str, np.ndarray]:
+    """Material and light. cameras: unit frame. What none of them sees is painted like what is next to it. Returns (and keeps)
+    base_color, roughness, metallic, normal, environment (unit frame), f0."""
     o = surface_options(options)
     with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
         face, bary = rasterise_atlas(mesh, o.texture)
@@ -317,10 +319,10 @@ def surface_stage(bank: PixelBank, mesh: Mesh, radiance: np.ndarray, run, option
         model = start_surface(start, known, mean, o, normals, metallic, roughness)
         fit_surface(bank, traced, model, o, stage, seed)
         base, roughness, metallic = pictures(model.material)
+        paint = {"base_color": base, "roughness": roughness, "metallic": metallic}
+        paint = painted_over(mesh, seen_faces(mesh, cameras), {n: fill_gutters(t, known) for n, t in paint.items()}, face, bary)
         maps = {
-            "base_color": fill_gutters(base, known),
-            "roughness": fill_gutters(roughness, known),
-            "metallic": fill_gutters(metallic, known),
+            **paint,
             "environment": model.environment.image(),
             "normal": normal_map(model.material),
             "f0": np.array(model.material.f0),
