@@ -15,8 +15,8 @@ from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import named
 from relit.fit.instance_search import Search
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
+from relit.fit.joint_alignment import follow_views
 from relit.fit.odd_instances import odd_instances, view_errors
-from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
@@ -46,7 +46,10 @@ def shape_stages(
         mesh = extract_mesh(values, faces=options.faces)
         if rate > 0:
             cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-            mesh, poses = follow_with_poses(mesh, cameras, [v.mask for v in views], [v.known for v in views], options.outlines)
+            pictures, masks, known = zip(*((v.rgb, v.mask, v.known) for v in views), strict=True)
+            mesh, poses, said = follow_views(mesh, cameras, pictures, masks, known, options.outlines)
+            if said:
+                run.say(said)
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")

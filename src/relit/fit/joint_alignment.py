@@ -1,0 +1,168 @@
+"""Poses and mesh as outlines and textures have them together, where the two disagree.
+
+`fit.outlines` believes the labels to a tenth of a pixel, and poses follow them. Labels that people or networks draw leave out wheels, cut
+corners and waver by a pixel or two; poses that follow those blur the texture, as each instance paints it in another place. So the textures
+are asked (`fit.texture_shifts`): where they lie more than a pixel off, the labels cannot be exact, and outlines and textures are solved
+for together, each weighted by what its samples scatter. Exact labels are left alone: they know more than optical flow does.
+
+One Gauss-Newton step for all poses and the displacements d of the vertices along their normals n. A place X that view j shows where view i
+shows it too moves in view i by
+
+    J_i δξ_i - M J_j δξ_j + (J_i n - M J_j n) d,    M = (J_i T) (J_j T)^-1
+
+with J the derivatives of the projections and T (3, 2) the tangents of the surface there: what moves in view j takes another piece of the
+surface, M brings that into view i.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import bmat, coo_matrix, diags, identity
+from scipy.sparse.linalg import splu
+
+from relit.cameras.se3 import exp_so3
+from relit.fit.outlines import FARTHEST, REST, STIFF, follow_with_poses, laplacian, moved, outline_of, precision
+from relit.fit.texture_shifts import Shifts, misfit, texture_shifts
+from relit.rendering.mitsuba_scene import build_geometry
+from relit.scene import Camera, Mesh
+
+EXACT = 1.0  # pixels by which textures may be off before labels are doubted
+TEXTURES, BOTH = 6, 8  # rounds: poses as textures have them, then poses and mesh as both have them
+FAINTEST = 0.15  # pixels; flow is told no better than this
+OUTLIER = 3.0  # spreads; a shift of so much counts a quarter
+SLANTED = 4.0  # size of M up to which a place is told
+DAMPED = 1e-4  # of the diagonal: the frame of all poses is free
+TURN = np.radians(3.0)  # of a pose, in one round
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Linear equations in pixels. poses: [(views (N,), (N, 6) derivatives)]. corners, along: (N, 3) vertices and derivatives by their
+    displacements. shift: (N,) what is asked for. trust: (N,) its weight."""
+
+    poses: list[tuple[np.ndarray, np.ndarray]]
+    corners: np.ndarray
+    along: np.ndarray
+    shift: np.ndarray
+    trust: np.ndarray
+
+
+def follow_views(mesh: Mesh, cameras: list[Camera], pictures, masks, known, rounds: int) -> tuple[Mesh, np.ndarray, str]:
+    """(mesh, poses (N, 4, 4), what is to be said of it or "") as outlines have them, and where these contradict the textures as both
+    have them.
+
+    mesh: welded, with normals. cameras: in its frame, whose origin the object is about. pictures: (h, w, 3) linear, masks, known: (h, w) of
+    each view, see `outlines.follow_with_poses`. rounds: of outlines alone.
+    """
+    outlined, poses = follow_with_poses(mesh, cameras, masks, known, rounds)
+    before = misfit(texture_shifts(outlined, with_poses(cameras, poses), pictures, masks))
+    if before <= EXACT:
+        return outlined, poses, ""
+    found, placed = outlined, with_poses(cameras, poses)
+    for n in range(TEXTURES + BOTH):
+        shifts = texture_shifts(found, placed, pictures, masks)
+        if not shifts:
+            return outlined, poses, ""
+        if n < TEXTURES:
+            _, placed = solved(found, placed, texture_rows(shifts, placed), still=True)
+        else:
+            found, placed = solved(found, placed, texture_rows(shifts, placed) + outline_rows(found, placed, masks, known))
+    after = misfit(texture_shifts(found, placed, pictures, masks))
+    if not 0 < after < before:
+        return outlined, poses, ""
+    said = f"poses that follow the labels alone leave textures {before:.1f} pixels off (median): they follow both now ({after:.1f} pixels)"
+    return found, np.array([c.world_from_camera for c in placed]), said
+
+
+def with_poses(cameras: list[Camera], poses: np.ndarray) -> list[Camera]:
+    return [c.with_pose(p) for c, p in zip(cameras, poses, strict=True)]
+
+
+def projection(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives (N, 2, 3) of the pixel by the point, and (N, 2, 6) by a motion of the camera's frame: a turn about the object's origin
+    and a translation, both in the camera's axes."""
+    m = camera.camera_from_world
+    q = points @ m[:3, :3].T + m[:3, 3]
+    by_place = np.zeros((len(q), 2, 3))
+    by_place[:, 0, 0], by_place[:, 1, 1] = camera.fx / q[:, 2], camera.fy / q[:, 2]
+    by_place[:, 0, 2], by_place[:, 1, 2] = -camera.fx * q[:, 0] / q[:, 2] ** 2, -camera.fy * q[:, 1] / q[:, 2] ** 2
+    return by_place @ m[:3, :3], np.concatenate([np.cross((q - m[:3, 3])[:, None], by_place), by_place], -1)
+
+
+def tangents(normals: np.ndarray) -> np.ndarray:
+    """(N, 3, 2) two unit tangents of unit normals (N, 3)."""
+    other = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    first = np.cross(normals, other)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first)], -1)
+
+
+def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
+    """Two equations for each place, x and y."""
+    spread = max(1.48 * misfit(shifts) / 1.18, FAINTEST)  # of one coordinate: the median length is 1.18 deviations
+    out = []
+    for s in shifts:
+        here, turn_here = projection(cameras[s.view], s.point)
+        there, turn_there = projection(cameras[s.other], s.point)
+        t = tangents(s.normal)
+        m = (here @ t) @ np.linalg.pinv(there @ t)
+        along = ((here - m @ there) @ s.normal[..., None])[..., 0]
+        far = np.linalg.norm(s.shift, axis=1) / (OUTLIER * spread)
+        trust = (np.linalg.norm(m, axis=(1, 2)) < SLANTED) / (spread * (1 + far**2)) ** 2
+        views = np.full(len(far), s.view), np.full(len(far), s.other)
+        for axis in (0, 1):
+            poses = [(views[0], turn_here[:, axis]), (views[1], -(m @ turn_there)[:, axis])]
+            out.append(Rows(poses, s.corners, s.weights * along[:, axis, None], s.shift[:, axis], trust))
+    return out
+
+
+def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known) -> list[Rows]:
+    """One equation for each sample of the outlines, across them."""
+    scene = build_geometry(mesh)
+    found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
+    trust = np.split(precision(np.concatenate([o.shift for o in found])), np.cumsum([len(o.shift) for o in found])[:-1])
+    out = []
+    for i, (camera, o, weight) in enumerate(zip(cameras, found, trust, strict=True)):
+        pose = camera.world_from_camera
+        by_motion = projection(camera, o.point @ pose[:3, :3].T + pose[:3, 3])[1]
+        across = (o.outward[:, None] @ by_motion)[:, 0]
+        out.append(Rows([(np.full(len(weight), i), across)], o.corners, o.weights * o.scale[:, None], o.shift, weight))
+    return out
+
+
+def solved(mesh: Mesh, cameras: list[Camera], rows: list[Rows], still: bool = False) -> tuple[Mesh, list[Camera]]:
+    """Mesh and cameras after one weighted least-squares step. still: the mesh stays."""
+    n, vertices = len(cameras), len(mesh.vertices)
+    starts = np.cumsum([0, *(len(r.shift) for r in rows)])
+    line, column, value = [], [], []
+    for r, start in zip(rows, starts[:-1], strict=True):
+        number = start + np.arange(len(r.shift))
+        parts = [(6 * views[:, None] + np.arange(6), by_motion) for views, by_motion in r.poses]
+        for columns, values in parts if still else [*parts, (6 * n + r.corners, r.along)]:
+            line.append(np.repeat(number, columns.shape[1]))
+            column.append(columns.ravel())
+            value.append(values.ravel())
+    unknowns = 6 * n + (0 if still else vertices)
+    a = coo_matrix((np.concatenate(value), (np.concatenate(line), np.concatenate(column))), (starts[-1], unknowns)).tocsr()
+    trust, shift = (np.concatenate([getattr(r, name) for r in rows]) for name in ("trust", "shift"))
+    normal = a.T @ diags(trust) @ a
+    damping = diags(DAMPED * normal.diagonal()[: 6 * n] + 1e-9)
+    pixels = float(np.median([c.fx / np.linalg.norm(c.centre) for c in cameras]))  # of a unit length
+    if not still:
+        smooth = pixels * laplacian(mesh.faces, vertices)
+        damping = bmat([[damping, None], [None, STIFF * (smooth.T @ smooth) + REST * pixels**2 * identity(vertices)]])
+    step = splu((normal + damping).tocsc()).solve(a.T @ (trust * shift))
+    placed = [turned(c, s) for c, s in zip(cameras, step[: 6 * n].reshape(n, 6), strict=True)]
+    return (mesh if still else moved(mesh, np.clip(step[6 * n :], -FARTHEST / pixels, FARTHEST / pixels))), placed
+
+
+def turned(camera: Camera, step: np.ndarray) -> Camera:
+    """The camera after a motion (6,) of what it sees, see `projection`."""
+    middle = camera.camera_from_world[:3, 3]
+    step = step * min(1.0, TURN / max(float(np.linalg.norm(step[:3])), 1e-12))
+    motion = np.eye(4)
+    motion[:3, :3] = exp_so3(step[:3])
+    motion[:3, 3] = middle + step[3:] - motion[:3, :3] @ middle
+    return camera.with_pose(camera.world_from_camera @ np.linalg.inv(motion))

@@ -1,0 +1,185 @@
+"""Poses follow textures where labels mislead them, and labels alone where these are exact."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from relit.cameras.se3 import exp_so3
+from relit.conventions import move_points
+from relit.fit.joint_alignment import (
+    EXACT,
+    follow_views,
+    misfit,
+    projection,
+    solved,
+    tangents,
+    texture_rows,
+    turned,
+    with_poses,
+)
+from relit.fit.outlines import follow_with_poses, trace
+from relit.fit.texture_shifts import neighbours, shown_by, texture_shifts
+from relit.rendering.mitsuba_scene import build_geometry
+from relit.scene import Camera, Mesh
+
+SIZE, FOCAL = 160, 400.0
+
+
+def lump() -> Mesh:
+    """An egg with bumps: its outlines tell poses, its surface is not a sphere's."""
+    shape = trimesh.creation.icosphere(5, 1.0)
+    v = np.asarray(shape.vertices)
+    radius = 0.45 * (1 + 0.15 * np.sin(3 * v[:, :1] + 1) * np.cos(4 * v[:, 1:2]) + 0.1 * np.sin(5 * v[:, 2:]))
+    v = v * radius * [1.25, 0.85, 1.0]
+    made = trimesh.Trimesh(v, shape.faces, process=False)
+    return Mesh(v.astype(np.float32), np.asarray(shape.faces, np.int32), np.asarray(made.vertex_normals, np.float32))
+
+
+def colours(points: np.ndarray) -> np.ndarray:
+    """A pattern without edges, in the object's frame."""
+    waves = np.random.default_rng(3).normal(size=(12, 3)) * 14
+    values = np.sin(points @ waves.T + np.arange(12))
+    return 0.5 + 0.12 * values.reshape(*points.shape[:-1], 3, 4).sum(-1)
+
+
+def camera_at(direction, turn) -> Camera:
+    z = -np.asarray(direction, float) / np.linalg.norm(direction)
+    x = np.cross(z, [0.3, 0.9, 0.1])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], 1) @ exp_so3([0, 0, turn]), -3 * z
+    return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """(mesh, cameras, pictures, masks): six views of one lump, within 60 degrees of their neighbours."""
+    mesh = lump()
+    scene = build_geometry(mesh)
+    sides = [(1, 0, 0), (1, 0.5, 0.1), (0.8, 0.2, 0.6), (1, -0.5, 0.2), (0.9, 0.1, -0.5), (0.7, 0.6, 0.5)]
+    cameras = [camera_at(s, 0.9 * k) for k, s in enumerate(sides)]
+    pictures, masks = [], []
+    part = (np.arange(4) + 0.5) / 4
+    y, x = np.mgrid[:SIZE, :SIZE]
+    at = np.broadcast_arrays(x[..., None, None] + part, y[..., None, None] + part[:, None])
+    for k, camera in enumerate(cameras):
+        shown = shown_by(mesh, scene, camera, np.ones((SIZE, SIZE), np.float32))
+        brightness = 0.6 + 0.3 * np.sin(0.02 * x + k)[..., None]  # light is another thing in each
+        pictures.append(np.where(shown.hit[..., None], brightness * colours(shown.point), 0.1).astype(np.float32))
+        hit = np.isfinite(trace(scene, camera, at[0].ravel(), at[1].ravel())[0])
+        masks.append(hit.reshape(SIZE, SIZE, 16).mean(-1).astype(np.float32))
+    return mesh, cameras, pictures, masks
+
+
+def astray(cameras, degrees, seed=0) -> list[Camera]:
+    turns = np.random.default_rng(seed).normal(size=(len(cameras), 3))
+    turns *= np.radians(degrees) / np.linalg.norm(turns, axis=1, keepdims=True)
+    return [turned(c, np.append(t, np.zeros(3))) for c, t in zip(cameras, turns, strict=True)]
+
+
+def apart(poses, cameras, mesh) -> float:
+    """Pixels by which the views disagree where in the object's frame the places of the surface are that they truly see, root mean square.
+    A motion of the whole is no difference."""
+    points = mesh.vertices[::50].astype(np.float64)
+    seen = np.array([move_points(p @ c.camera_from_world, points) for p, c in zip(poses, cameras, strict=True)])
+    return float(np.sqrt(np.square(seen - seen.mean(0)).sum(-1).mean()) * FOCAL / 3)
+
+
+def everywhere(masks) -> list[np.ndarray]:
+    return [np.ones_like(m) for m in masks]
+
+
+def test_derivatives_are_those_of_the_projection(seen):
+    mesh, cameras, *_ = seen
+    points, camera, h = mesh.vertices[::500].astype(np.float64), cameras[1], 1e-6
+    by_place, by_motion = projection(camera, points)
+    for axis in range(3):
+        moved = points + h * np.eye(3)[axis]
+        np.testing.assert_allclose((camera.project(moved) - camera.project(points))[:, :2] / h, by_place[..., axis], rtol=1e-4, atol=1e-2)
+    for axis in range(6):
+        after = turned(camera, h * np.eye(6)[axis])
+        np.testing.assert_allclose((after.project(points) - camera.project(points))[:, :2] / h, by_motion[..., axis], rtol=1e-4, atol=1e-2)
+    n = mesh.normals[::500].astype(np.float64)
+    t = tangents(n)
+    np.testing.assert_allclose(np.swapaxes(t, 1, 2) @ t, np.broadcast_to(np.eye(2), (len(n), 2, 2)), atol=1e-6)
+    np.testing.assert_allclose((n[:, None] @ t)[:, 0], 0, atol=1e-6)
+
+
+def test_pictures_lie_on_each_other_where_all_is_right(seen):
+    mesh, cameras, pictures, masks = seen
+    shifts = texture_shifts(mesh, cameras, pictures, masks)
+    assert len(shifts) == len(neighbours(cameras)) >= 20 and misfit(shifts) < 0.15
+    assert misfit([]) == 0
+
+
+def test_a_pose_is_asked_back_by_the_pixels_that_it_is_off(seen):
+    """The shift is what the projection by the true pose says, in size and in sign, and so in both places of a pair."""
+    mesh, cameras, pictures, masks = seen
+    wrong = [astray(cameras[:1], 2.0, seed=4)[0], *cameras[1:]]
+    for s in texture_shifts(mesh, wrong, pictures, masks):
+        if s.view == 0:
+            asked = (cameras[0].project(s.point) - wrong[0].project(s.point))[:, :2]
+            size = np.linalg.norm(asked, axis=1).mean()
+            assert size > 1.5 and np.median(np.linalg.norm(s.shift - asked, axis=1)) < 0.35 * size
+    rows = texture_rows(texture_shifts(mesh, wrong, pictures, masks), wrong)
+    _, placed = solved(mesh, wrong, rows, still=True)
+    before, after = (apart([c.world_from_camera for c in some], cameras, mesh) for some in (wrong, placed))
+    assert after < 0.35 * before
+
+
+def test_a_mesh_that_is_too_thin_is_told_by_parallax(seen):
+    """By the flow, and by the derivatives: what view j shows at a place is what its ray meets on the true surface, seen by view i."""
+    mesh, cameras, pictures, masks = seen
+    scene, depth = build_geometry(mesh), 0.01
+    thin = replace(mesh, vertices=(mesh.vertices - depth * mesh.normals).astype(np.float32))
+    shifts = texture_shifts(thin, cameras, pictures, masks)
+    rows = texture_rows(shifts, cameras)
+    truth, flow, told = [], [], []
+    for s, x, y in zip(shifts, rows[::2], rows[1::2], strict=True):
+        other = cameras[s.other]
+        far = trace(scene, other, *other.project(s.point)[:, :2].T)[0]
+        ray = s.point - other.centre
+        met = other.centre + ray * (far / np.linalg.norm(ray, axis=1))[:, None]
+        use = np.isfinite(far) & (x.trust > 0)
+        truth.append((cameras[s.view].project(met) - cameras[s.view].project(s.point))[use, :2])
+        told.append(depth * np.stack([x.along.sum(1), y.along.sum(1)], -1)[use])
+        flow.append(s.shift[use])
+    truth, flow, told = (np.concatenate(some).ravel() for some in (truth, flow, told))
+    assert np.abs(truth).mean() > 0.8
+    assert np.corrcoef(truth, told)[0, 1] > 0.99 and 0.9 < truth @ told / (told @ told) < 1.1
+    assert np.corrcoef(truth, flow)[0, 1] > 0.85 and 0.5 < flow @ truth / (truth @ truth) < 1.1  # flow shrinks: rounds make up for it
+    found, _ = solved(thin, cameras, rows)
+    assert ((found.vertices - thin.vertices) * mesh.normals).sum(1).mean() > 0
+
+
+def test_exact_labels_are_believed_alone(seen):
+    mesh, cameras, pictures, masks = seen
+    wrong = astray(cameras, 1.0)
+    found, poses, said = follow_views(mesh, wrong, pictures, masks, everywhere(masks), 5)
+    expected, alone = follow_with_poses(mesh, wrong, masks, everywhere(masks), 5)
+    np.testing.assert_array_equal(poses, alone)
+    np.testing.assert_array_equal(found.vertices, expected.vertices)
+    assert said == "" and apart(poses, cameras, mesh) < 0.5
+
+
+def test_labels_that_mislead_are_outvoted_by_textures(seen):
+    """Labels moved by three pixels, each its own way."""
+    mesh, cameras, pictures, masks = seen
+    ways = [(3, 0), (-2, 2), (0, -3), (-3, 1), (2, 2), (1, -3)]
+    wrong = [np.roll(m, (dy, dx), (0, 1)) for m, (dx, dy) in zip(masks, ways, strict=True)]
+    _, alone = follow_with_poses(mesh, cameras, wrong, everywhere(masks), 5)
+    found, poses, said = follow_views(mesh, cameras, pictures, wrong, everywhere(masks), 5)
+    assert misfit(texture_shifts(mesh, with_poses(cameras, alone), pictures, wrong)) > EXACT
+    assert misfit(texture_shifts(found, with_poses(cameras, poses), pictures, wrong)) < EXACT and "textures" in said
+    assert apart(poses, cameras, mesh) < 0.5 * apart(alone, cameras, mesh)
+
+
+def test_without_texture_outlines_are_followed_alone(seen):
+    mesh, cameras, pictures, masks = seen
+    plain = [np.full_like(p, 0.5) for p in pictures]
+    assert texture_shifts(mesh, cameras, plain, masks) == []
+    _, poses, said = follow_views(mesh, cameras, plain, masks, everywhere(masks), 2)
+    np.testing.assert_array_equal(poses, follow_with_poses(mesh, cameras, masks, everywhere(masks), 2)[1])
+    assert said == ""
