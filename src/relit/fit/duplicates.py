@@ -4,7 +4,7 @@
     photos    of several photos of one pile how they stand to each other                 fit/pile_photos.py
     joint     one signed distance field in the object's frame, seen by all virtual cameras, moves with the poses; odd ones out fit/volume.py
     volume    the same once more, from those poses; who was left out is sought in it          fit/duplicates_shape.py, fit/sought_again.py
-    mesh       zero level set, decimated; mesh and poses as the outlines are; texture atlas; the ground      fit/outlines.py
+    mesh       zero level set, decimated; mesh and poses as outlines and textures are; texture atlas; the ground      fit/joint_alignment.py
     surface    one material for all instances and one environment, light traced past all instances and the ground     fit/surface.py
     asset      object, instances, ground and light in the frame of the user's camera
 
