@@ -28,6 +28,7 @@ from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.run import run_arrays
+from relit.scene import Mesh
 
 HOLD = 40  # steps of a volume pass of one level before poses move
 
@@ -45,11 +46,7 @@ def shape_stages(
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
         if rate > 0:
-            cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-            pictures, masks, known = zip(*((v.rgb, v.mask, v.known) for v in views), strict=True)
-            mesh, poses, said = follow_views(mesh, cameras, pictures, masks, known, options.outlines)
-            if said:
-                run.say(said)
+            mesh, poses, _ = followed(mesh, views, poses, run, options)
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
@@ -90,9 +87,20 @@ def shape_stages(
     return parts
 
 
+def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, bool]:
+    """(mesh, poses, were textures followed too) after `joint_alignment.follow_views`."""
+    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+    pictures, masks, known = zip(*((v.rgb, v.mask, v.known) for v in views), strict=True)
+    mesh, poses, said = follow_views(mesh, cameras, pictures, masks, known, options.outlines)
+    if said:
+        run.say(said)
+    return mesh, poses, bool(said)
+
+
 def joint_stage(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
     """(poses, odd (N,) bool) after a first volume pass. What it gives is thrown away but for the poses, and which instances show what does
-    not agree with the model of all: a shape that grew up with better poses is sharper, and moves them on."""
+    not agree with the model of all: a shape that grew up with better poses is sharper, and moves them on. Textures are asked here already:
+    what the pass has built in the wrong place it does not take back."""
     if run.done("joint"):
         saved = run_arrays(run, "joint", "joint")
         return saved["poses"], saved["odd"]
@@ -101,6 +109,10 @@ def joint_stage(views: list[View], poses: np.ndarray, run, options: DuplicatesOp
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
+        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
+        _, moved, textures = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
+        if textures:
+            poses[~odd] = moved
         stage.save("joint", poses=poses, odd=odd)
     return poses, odd
 
