@@ -173,7 +173,10 @@ DUPLICATES = Suite(
     },
     ablations={
         name: (f"without={name}",)
-        for name in ("rotation_sweep", "matching", "guided", "search", "refinement", "visibility", "hidden", "metal", "ground", "normals")
+        for name in (
+            *("rotation_sweep", "matching", "guided", "search", "refinement"),
+            *("textures", "visibility", "hidden", "metal", "ground", "normals"),
+        )
     },
 )
 

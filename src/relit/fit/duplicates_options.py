@@ -55,6 +55,7 @@ WITHOUT = {
     "guided": "matches are not sought again once poses are known",
     "search": "what matching does not link is dropped, and of several sets that it links all but the largest",
     "refinement": "poses stay as search has found them",
+    "textures": "mesh and poses follow the outlines of the labels alone",
     "visibility": "no instance, and no ground, shadows another",
     "normals": "normal priors are not used",
     "metal": "no term pulls metallic to 0 or 1",

@@ -17,6 +17,7 @@ from relit.fit.instance_search import Search
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
 from relit.fit.odd_instances import odd_instances, view_errors
+from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
@@ -88,9 +89,11 @@ def shape_stages(
 
 
 def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, bool]:
-    """(mesh, poses, were textures followed too) after `joint_alignment.follow_views`."""
+    """(mesh, poses, were textures followed too) after `joint_alignment.follow_views`, or `outlines.follow_with_poses`."""
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
     pictures, masks, known = zip(*((v.rgb, v.mask, v.known) for v in views), strict=True)
+    if "textures" in options.without:
+        return *follow_with_poses(mesh, cameras, masks, known, options.outlines), False
     mesh, poses, said = follow_views(mesh, cameras, pictures, masks, known, options.outlines)
     if said:
         run.say(said)
