@@ -89,7 +89,7 @@ def shape_stages(
 
 
 def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, bool]:
-    """(mesh, poses, were textures followed too) after `joint_alignment.follow_views`, or `outlines.follow_with_poses`."""
+    """(mesh, poses, do textures have a part in it) as outlines, and where these are not exact textures too, have them."""
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
     pictures, masks, known = zip(*((v.rgb, v.mask, v.known) for v in views), strict=True)
     if "textures" in options.without:
@@ -112,10 +112,10 @@ def joint_stage(views: list[View], poses: np.ndarray, run, options: DuplicatesOp
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
-        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
-        _, moved, textures = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
-        if textures:
-            poses[~odd] = moved
+        if "textures" not in options.without:
+            mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
+            _, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
+            poses[~odd] = moved if disagree else poses[~odd]
         stage.save("joint", poses=poses, odd=odd)
     return poses, odd
 

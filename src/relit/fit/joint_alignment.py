@@ -22,8 +22,7 @@ import numpy as np
 from scipy.sparse import bmat, coo_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
-from relit.cameras.se3 import exp_so3
-from relit.fit.outlines import FARTHEST, REST, STIFF, follow_with_poses, laplacian, moved, outline_of, precision
+from relit.fit.outlines import FARTHEST, REST, STIFF, after_motion, by_motion, follow_with_poses, laplacian, moved, outline_of, precision
 from relit.fit.texture_shifts import Shifts, misfit, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
@@ -125,9 +124,7 @@ def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known) -> list[Rows]:
     trust = np.split(precision(np.concatenate([o.shift for o in found])), np.cumsum([len(o.shift) for o in found])[:-1])
     out = []
     for i, (camera, o, weight) in enumerate(zip(cameras, found, trust, strict=True)):
-        pose = camera.world_from_camera
-        by_motion = projection(camera, o.point @ pose[:3, :3].T + pose[:3, 3])[1]
-        across = (o.outward[:, None] @ by_motion)[:, 0]
+        across = by_motion(camera, o, camera.camera_from_world[:3, 3])
         out.append(Rows([(np.full(len(weight), i), across)], o.corners, o.weights * o.scale[:, None], o.shift, weight))
     return out
 
@@ -159,10 +156,6 @@ def solved(mesh: Mesh, cameras: list[Camera], rows: list[Rows], still: bool = Fa
 
 
 def turned(camera: Camera, step: np.ndarray) -> Camera:
-    """The camera after a motion (6,) of what it sees, see `projection`."""
-    middle = camera.camera_from_world[:3, 3]
-    step = step * min(1.0, TURN / max(float(np.linalg.norm(step[:3])), 1e-12))
-    motion = np.eye(4)
-    motion[:3, :3] = exp_so3(step[:3])
-    motion[:3, 3] = middle + step[3:] - motion[:3, :3] @ middle
-    return camera.with_pose(camera.world_from_camera @ np.linalg.inv(motion))
+    """The camera after a motion (6,) of what it sees, see `projection`; a turn of more than TURN shortens it."""
+    shorter = min(1.0, TURN / max(float(np.linalg.norm(step[:3])), 1e-12))
+    return camera.with_pose(after_motion(camera, shorter * step, camera.camera_from_world[:3, 3]))

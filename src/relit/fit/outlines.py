@@ -74,21 +74,30 @@ def follow_with_poses(mesh: Mesh, cameras: list[Camera], masks, known, rounds: i
 def turned(camera: Camera, outline: Outline) -> np.ndarray:
     """The camera's pose (4, 4) with which the outline moves as its samples ask for: one Gauss-Newton step over turns about the middle of
     what is seen, and translations."""
-    x, m = outline.point, outline.outward * [camera.fx, camera.fy]
-    pose = np.asarray(camera.world_from_camera, np.float64)
-    if len(x) < 30:
-        return pose
-    across = np.stack([m[:, 0], m[:, 1], -(m * x[:, :2]).sum(1) / x[:, 2]], -1) / x[:, 2:]  # ds / dx
-    middle = x.mean(0)
-    rows = np.concatenate([np.cross(x - middle, across), across], 1)
+    if len(outline.point) < 30:
+        return np.asarray(camera.world_from_camera, np.float64)
+    middle = outline.point.mean(0)
+    rows = by_motion(camera, outline, middle)
     trust = precision(outline.shift)
     normal = (rows * trust[:, None]).T @ rows
     normal += 1e-6 * np.diag(np.diag(normal))
-    step = np.linalg.solve(normal, rows.T @ (trust * outline.shift))
+    return after_motion(camera, np.linalg.solve(normal, rows.T @ (trust * outline.shift)), middle)
+
+
+def by_motion(camera: Camera, outline: Outline, middle: np.ndarray) -> np.ndarray:
+    """Derivatives (N, 6) of the outline's place across itself, in pixels, by a motion of what is seen: turns about `middle` (3,) and
+    translations, both in the camera's axes."""
+    x, m = outline.point, outline.outward * [camera.fx, camera.fy]
+    across = np.stack([m[:, 0], m[:, 1], -(m * x[:, :2]).sum(1) / x[:, 2]], -1) / x[:, 2:]
+    return np.concatenate([np.cross(x - middle, across), across], 1)
+
+
+def after_motion(camera: Camera, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """The camera's pose (4, 4) from which it looks as if what is seen had made the motion `step` (6,), see `by_motion`."""
     motion = np.eye(4)
     motion[:3, :3] = exp_so3(step[:3])
     motion[:3, 3] = middle + step[3:] - motion[:3, :3] @ middle
-    return pose @ np.linalg.inv(motion)
+    return np.asarray(camera.world_from_camera, np.float64) @ np.linalg.inv(motion)
 
 
 def precision(shift: np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ def texture_shifts(mesh: Mesh, cameras: list[Camera], pictures: list[np.ndarray]
     masks: (h, w). Pairs that share too little, or hardly any structure, are left out."""
     scene = build_geometry(mesh)
     shown = [shown_by(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
-    found = [shifts_of(i, j, shown[i], scene, cameras[j], pictures[i], pictures[j], masks[j]) for i, j in neighbours(cameras)]
+    found = [shifts_of(mesh, scene, i, j, shown[i], cameras, pictures, masks[j]) for i, j in neighbours(cameras)]
     return [one for one in found if one is not None]
 
 
@@ -84,30 +84,35 @@ def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
 
 
 def shown_by(mesh: Mesh, scene, camera: Camera, mask: np.ndarray) -> Shown:
+    """Of all pixels of a view."""
     y, x = np.mgrid[: mask.shape[0], : mask.shape[1]]
-    depth, face, uv = trace(scene, camera, x.ravel() + 0.5, y.ravel() + 0.5)
+    hit, *places = places_of(mesh, scene, camera, x.ravel() + 0.5, y.ravel() + 0.5)
+    return Shown(hit.reshape(mask.shape) & (mask > 0.5), *(a.reshape(*mask.shape, 3) for a in places))
+
+
+def places_of(mesh: Mesh, scene, camera: Camera, x: np.ndarray, y: np.ndarray):
+    """hit (N,), corners, weights, points and normals (N, 3) of what positions (N,) in a picture show, as in `Shown`."""
+    depth, face, uv = trace(scene, camera, x, y)
     hit = np.isfinite(depth)
     corners, uv = mesh.faces[np.where(hit, face, 0)], np.where(hit[:, None], uv, 0)
     weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], -1)
     point, normal = ((of[corners] * weights[..., None]).sum(1).astype(np.float64) for of in (mesh.vertices, mesh.normals))
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    whole = (*mask.shape, 3)
-    return Shown(hit.reshape(mask.shape) & (mask > 0.5), *(a.reshape(whole) for a in (corners, weights, point, normal)))
+    return hit, corners, weights, point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
 
 
-def shifts_of(i: int, j: int, shown: Shown, scene, camera: Camera, picture, other, mask) -> Shifts | None:
-    """Of view i against view j. camera, other, mask: of view j. shown, picture: of view i."""
+def shifts_of(mesh: Mesh, scene, i: int, j: int, shown: Shown, cameras: list[Camera], pictures, mask: np.ndarray) -> Shifts | None:
+    """Of view i, which shows `shown`, against view j with its mask."""
     point = shown.point[shown.hit]
-    x, y, _ = camera.project(point).T
-    common = seen_points(scene, point, shown.normal[shown.hit], [camera], GRAZING)
+    x, y, _ = cameras[j].project(point).T
+    common = seen_points(scene, point, shown.normal[shown.hit], [cameras[j]], GRAZING)
     common &= map_coordinates(mask, [y - 0.5, x - 0.5], order=1, mode="constant") > 0.9
     both = np.zeros(shown.hit.shape, bool)
     both[shown.hit] = common
     if both.sum() < OVERLAP:
         return None
     brought = np.zeros(both.shape, np.float32)
-    brought[shown.hit] = map_coordinates(brightness(other), [y - 0.5, x - 0.5], order=1, mode="nearest")
-    a, b = contrasts(brightness(picture), both), contrasts(brought, both)
+    brought[shown.hit] = map_coordinates(brightness(pictures[j]), [y - 0.5, x - 0.5], order=1, mode="nearest")
+    a, b = contrasts(brightness(pictures[i]), both), contrasts(brought, both)
     flow, good = confirmed_flow(a, b, both)
     row, column = np.nonzero(good)
     if len(row) < LEAST:
@@ -115,8 +120,9 @@ def shifts_of(i: int, j: int, shown: Shown, scene, camera: Camera, picture, othe
     chosen = np.unique(np.linspace(0, len(row) - 1, min(SAMPLES, len(row))).round().astype(int))
     row, column = row[chosen], column[chosen]
     shift = flow[row, column].astype(np.float64)
-    at = np.rint(row + shift[:, 1]).astype(int), np.rint(column + shift[:, 0]).astype(int)  # where the other shows that place now
-    return Shifts(i, j, shown.corners[at], shown.weights[at], shown.point[at], shown.normal[at], -shift)
+    # where the other shows that place now
+    hit, *places = places_of(mesh, scene, cameras[i], column + 0.5 + shift[:, 0], row + 0.5 + shift[:, 1])
+    return Shifts(i, j, *(a[hit] for a in (*places, -shift)))
 
 
 def brightness(picture: np.ndarray) -> np.ndarray:
