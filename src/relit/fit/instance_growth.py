@@ -12,26 +12,36 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
 from relit.fit.instances import View, albedo_render, carved, first_pose, fit_model
 from relit.fit.register import Crop, Gallery, Render, Rings, directions_around, refine, rings_of, search, views_from
 
+ANOTHER = 25.0  # degrees from which on a pose is another one
+
 
 @dataclass(frozen=True)
 class Growth:
-    """How a set of placed instances grows. nodes, steps, rate, depth: of the coarse models, as `Search`. viewpoints: all around. cone:
-    degrees around what the placed ones have shown within which others are looked for. keep: guesses for each that are refined. gap: those
-    join together whose scores lie within it of the best. astray: a member whose score lies so much below the median is taken out again."""
+    """How a set of placed instances grows.
+
+    nodes, steps, rate, depth: of the coarse models, as `Search`. tolerance: see `carved`; a body that is too fat agrees with wrong places
+    as well, and with more of them at every turn. viewpoints: all around. cone: degrees around what the placed ones have shown within which
+    others are looked for. keep: places of each that are refined. sure: an instance whose best place scores by so much better than any
+    other is nearly always right; while there are such, they join first. leap: spread of scores within which, where none is sure, a draw
+    decides who joins and where. astray: a member whose score lies so much below the median is taken out again.
+    """
 
     nodes: int = 40
-    steps: int = 50
+    steps: int = 100
     rate: float = 0.004
     depth: float = 2.5
-    viewpoints: int = 1500
+    viewpoints: int = 600
     cone: float = 60.0
-    keep: int = 3
-    gap: float = 0.02
+    keep: int = 4
     astray: float = 0.15
+    tolerance: float = 0.15
+    sure: float = 0.06
+    leap: float = 0.015
 
 
 def seen_from(poses: np.ndarray) -> np.ndarray:
@@ -40,20 +50,42 @@ def seen_from(poses: np.ndarray) -> np.ndarray:
     return c / np.linalg.norm(c, axis=1, keepdims=True)
 
 
-def grow(
-    views: list[View], crops: list[Crop], rings: Rings, parts, members: list[int], poses: np.ndarray, o: Growth, *, seed: int = 0, links=()
-) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (N, 4, 4) and scores (N,) of all instances, grown from `members`, whose entries of `poses` count.
+@dataclass(frozen=True)
+class Grown:
+    """What growth has given. poses: (N, 4, 4), scores: (N,) of all instances. firm: those that stood or joined before the first that was
+    not sure of its place. leaps: how many were not."""
 
-    links: ((i, j, rotation of i onto j in the photo), ...) from matching, tried beside the guesses of the search. Raises NoShape where
-    the silhouettes of the members have nothing in common.
+    poses: np.ndarray
+    scores: np.ndarray
+    firm: tuple[int, ...]
+    leaps: int
+
+
+def grow(
+    views: list[View],
+    crops: list[Crop],
+    rings: Rings,
+    parts,
+    members: list[int],
+    poses: np.ndarray,
+    o: Growth,
+    *,
+    seed: int = 0,
+    links=(),
+    rng=None,
+) -> Grown:
+    """All instances, grown from `members`, whose entries of `poses` count.
+
+    links: ((i, j, rotation of i onto j in the photo), ...) from matching, tried beside the guesses of the search. rng: draws who joins
+    where none is sure; without it the best score does. Raises NoShape where the silhouettes of the members have nothing in common.
     """
     poses, scores = np.array(poses, np.float64), np.full(len(views), -1.0)
     members, expelled, turn = list(members), Counter(), 0
+    firm, leaps = list(members), 0
     while True:
         turn += 1
         some = [views[k] for k in members]
-        values = carved(some, poses[members], o.nodes, 0.3 if len(members) > 3 else 0.15, o.depth)
+        values = carved(some, poses[members], o.nodes, o.tolerance, o.depth, crossed=len(members) > 3)
         model, poses[members] = fit_model(some, poses[members], values, o.steps, refine_cameras=o.rate, seed=seed)
         render = albedo_render(model)
         poses[members], scores[members] = refine(
@@ -66,15 +98,47 @@ def grow(
             members = [k for k in members if k not in astray]
         rest = [k for k in range(len(views)) if k not in members]
         if not rest:
-            return poses, scores
-        poses[rest], scores[rest] = registered(views, crops, rings, parts, render, poses, members, rest, o, seed + turn, links)
-        order = sorted(rest, key=lambda k: -scores[k])
-        alike = sum(scores[k] >= scores[order[0]] - o.gap for k in rest)
-        members += order[: max(1, min(alike, len(members) // 2))]
+            return Grown(poses, scores, tuple(k for k in firm if k in members), leaps)
+        places, heights = registered(views, crops, rings, parts, render, poses, members, rest, o, seed + turn, links)
+        best = heights.argmax(0)
+        margins = lead(places, heights)
+        order = sorted(range(len(rest)), key=lambda i: -margins[i])
+        join = [i for i in order if margins[i] >= o.sure][: max(1, len(members) // 2)]
+        if not join:
+            chosen = drawn(heights, o.leap, rng)
+            join, best[chosen[1]] = [chosen[1]], chosen[0]
+            leaps += 1
+        elif not leaps:
+            firm += [rest[i] for i in join]
+        for i in join:
+            k = rest[i]
+            poses[k], scores[k] = places[best[i], i], heights[best[i], i]
+            members.append(k)
+
+
+def lead(places: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """(R,) by how much the best of the places (K, R, 4, 4) of each scores better than the best one that is ANOTHER degrees away from it or
+    more; heights: (K, R) their scores."""
+    out = np.empty(heights.shape[1])
+    for i, best in enumerate(heights.argmax(0)):
+        away = [rotation_angle(places[best, i, :3, :3].T @ p[:3, :3]) >= ANOTHER for p in places[:, i]]
+        out[i] = heights[best, i] - max(heights[away, i], default=0.0)
+    return out
+
+
+def drawn(heights: np.ndarray, spread: float, rng) -> tuple[int, int]:
+    """(place, instance) of scores (K, R): the best, or where there is an rng one that it draws, the likelier the better its score."""
+    if rng is None:
+        at = int(heights.argmax())
+    else:
+        p = np.exp((heights - heights.max()) / spread).ravel()
+        at = int(rng.choice(heights.size, p=p / p.sum()))
+    place, instance = divmod(at, heights.shape[1])
+    return place, instance
 
 
 def registered(views, crops, rings: Rings, parts, render: Render, poses, members: list[int], rest: list[int], o: Growth, seed: int, links):
-    """Poses and scores of `rest` against the model of `members`: the best of what near-by viewpoints show and of what links say."""
+    """Places (K, R, 4, 4) of `rest` against the model of `members` and their scores (K, R): what near-by viewpoints show and links say."""
     far = float(np.median(np.linalg.norm(poses[members][:, :3, 3], axis=1)))
     directions = directions_around(o.viewpoints, seed)
     close = (directions @ seen_from(poses[members]).T).max(1) > np.cos(np.radians(o.cone))
@@ -82,17 +146,13 @@ def registered(views, crops, rings: Rings, parts, render: Render, poses, members
     rgb, alpha = render(cameras)
     theirs, some = chosen_rings(rings, rest), [crops[k] for k in rest]
     # not look_for: what is hidden in part would fit early, and wrongly
-    found = search(some, Gallery(cameras, rings_of(rgb, alpha, parts=parts)), keep=o.keep, rings=theirs)
+    found = search(some, Gallery(cameras, rings_of(rgb, alpha, parts=parts)), keep=o.keep, rings=theirs, apart=ANOTHER)
     tries = [found.poses[:, j] for j in range(o.keep)]
     told = linked_poses(views, poses, members, rest, links, far)
     if told:
         tries.append(np.array([told.get(k, tries[0][i]) for i, k in enumerate(rest)]))
-    best_poses, best = tries[0], np.full(len(rest), -1.0)
-    for start in tries:
-        other, score = refine(some, start, render, rings=theirs, steps=(0, 5.0, 2.5), parts=parts)
-        better = score > best
-        best_poses, best = np.where(better[:, None, None], other, best_poses), np.where(better, score, best)
-    return best_poses, best
+    refined = [refine(some, start, render, rings=theirs, steps=(0, 5.0, 2.5), parts=parts) for start in tries]
+    return np.array([poses for poses, _ in refined]), np.array([height for _, height in refined])
 
 
 def linked_poses(views, poses, members: list[int], rest: list[int], links, distance: float) -> dict[int, np.ndarray]:

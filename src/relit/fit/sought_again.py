@@ -16,7 +16,7 @@ import numpy as np
 
 from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_lookup import look_for
-from relit.fit.instance_search import DETAILED, PARTS, crops_of
+from relit.fit.instance_search import DETAILED, crops_of
 from relit.fit.instances import View, albedo_render, move_poses, moved_poses, pixel_bank
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
@@ -25,6 +25,7 @@ from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
 
 VIEWPOINTS = 2500
+PARTS = (0.5, 2.0, 0.6)  # weights of fit.register's descriptors that are tried beside DETAILED: one light, so brightness tells
 TRIES = 12  # places of an instance that are tried, half of them under each descriptor and these at least APART degrees from each other
 APART = 12.0
 ANOTHER = 25.0  # degrees from which on a place is another one
