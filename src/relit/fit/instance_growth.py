@@ -18,6 +18,7 @@ from relit.fit.instances import View, albedo_render, carved, first_pose, fit_mod
 from relit.fit.register import Crop, Gallery, Render, Rings, directions_around, refine, rings_of, search, views_from
 
 ANOTHER = 25.0  # degrees from which on a pose is another one
+AT_ONCE = 12  # members for each further one that may join unsure of its place at the same time: one does not spoil a model of many
 
 
 @dataclass(frozen=True)
@@ -105,9 +106,11 @@ def grow(
         order = sorted(range(len(rest)), key=lambda i: -margins[i])
         join = [i for i in order if margins[i] >= o.sure][: max(1, len(members) // 2)]
         if not join:
-            chosen = drawn(heights, o.leap, rng)
-            join, best[chosen[1]] = [chosen[1]], chosen[0]
-            leaps += 1
+            place, first = drawn(heights, o.leap, rng)
+            best[first] = place
+            others = [i for i in np.argsort(-heights.max(0)).tolist() if i != first]
+            join = [first, *others[: len(members) // AT_ONCE]]
+            leaps += len(join)
         elif not leaps:
             firm += [rest[i] for i in join]
         for i in join:

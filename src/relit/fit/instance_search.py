@@ -39,6 +39,7 @@ LOW = 0.1  # see `regrown`: so much below the median
 REGROWN = 2  # times at most
 KEPT = (0.3, 0.7)  # shares of the instances that stay while the others are grown again, see `improved`
 WAVER = 0.03  # standard deviation of what is added to the scores that say which
+TEN = 10  # instances from which on fewer tries are made: they take longer, and growth goes wrong less often
 NO_GAIN = 0.001  # of the mean agreement: too little to go on for
 
 
@@ -281,7 +282,7 @@ def improved(views, crops, rings: Rings, best: Placed, o: Search, *, seed: int, 
     one that is drawn. Where none is sure who joins next, a draw decides.
     """
     rng, idle = np.random.default_rng(seed), 0
-    for turn in range(o.regrowths):
+    for turn in range(max(2, round(o.regrowths * min(1.0, TEN / len(views))))):
         stay = staying(best, turn, rng)
         try:
             grown = grow(views, crops, rings, DETAILED, stay, best.poses.copy(), o.growth, seed=seed + turn, links=links, rng=rng)
