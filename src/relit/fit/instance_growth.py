@@ -99,7 +99,7 @@ def grow(
             members = [k for k in members if k not in astray]
         rest = [k for k in range(len(views)) if k not in members]
         if not rest:
-            return Grown(poses, scores, tuple(k for k in firm if k in members), leaps)
+            return Grown(poses, scores, tuple(dict.fromkeys(k for k in firm if k in members)), leaps)  # some left and came back
         places, heights = registered(views, crops, rings, parts, render, poses, members, rest, o, seed + turn, links)
         best = heights.argmax(0)
         margins = lead(places, heights)
