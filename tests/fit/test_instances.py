@@ -131,7 +131,6 @@ def test_growth_starts_where_the_next_guess_is_far_worse_and_from_no_pair_twice(
     assert sorted(first_pairs(guesses, [0, 1, 2], 2)) == [(0, 3), (2, 1)]
     assert first_pairs(guesses, [0, 1, 2], 3)[2] == (1, 0)
     assert len(first_pairs(guesses, [0, 1, 2], 20)) == 6  # of four instances
-    assert guesses.chance == pytest.approx(0.7)
 
 
 def test_a_place_leads_over_those_that_are_turned_and_not_over_its_own_neighbours():

@@ -1,8 +1,8 @@
 """Poses of identical objects by growth: from the pair that looks most alike, one instance after another is registered against a coarse
 model of those that stand already.
 
-The guesses for pairs that score best (fit.instance_search.pair_guesses) are right far more often than the rest. So poses are believed in
-the order of their scores, as in incremental structure from motion, and each instance that joins makes the model better for the next.
+A place that leads clearly over every other one is nearly always right (`lead`). So such instances join first, as in incremental structure
+from motion, and each that joins makes the model better for the next; where none leads, one joins unsure of its place.
 """
 
 from __future__ import annotations

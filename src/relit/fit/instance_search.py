@@ -2,6 +2,7 @@
 
 pair_guesses   every instance's silhouette is inflated to a crude model, and every other instance registered against it, several ways
 grow           one instance after another joins those that stand already (fit/instance_growth.py); from several pairs, the best counts
+improved       where instances were not sure of their places: taken out and grown again, another way each time
 settle         a coarse model is fitted to all instances, all poses are searched again by rendering it; a few rounds
 """
 
@@ -96,11 +97,6 @@ class Guesses:
         first, second = self.scores[..., 0], self.scores[..., 1]
         return np.where(first > -1, first - np.maximum(second, 0), -1.0)
 
-    @property
-    def chance(self) -> float:
-        """The score of a pair that has little to do with each other."""
-        return float(np.median(self.scores[..., 0][self.scores[..., 0] > -1]))
-
 
 def pair_guesses(views: list[View], crops, chosen: list[int], o: Search, distance: float, seed: int, say) -> dict[tuple, Guesses]:
     """Guesses under each of two descriptors (DETAILED, COLOURFUL): every chosen instance is inflated to a model, and every other one is
@@ -117,7 +113,7 @@ def pair_guesses(views: list[View], crops, chosen: list[int], o: Search, distanc
         rgb, alpha = albedo_render(model)(cameras)
         for parts, guesses in out.items():
             gallery = Gallery(cameras, rings_of(rgb, alpha, parts=parts))
-            found = search(crops, gallery, keep=o.keep, rings=rings[parts], apart=25.0)
+            found = search(crops, gallery, keep=o.keep, rings=rings[parts], apart=ANOTHER)
             guesses.poses[s], guesses.scores[s] = found.poses, found.scores
             guesses.poses[s, k], guesses.scores[s, k] = pose, -1.0
         say(s + 1, len(chosen))

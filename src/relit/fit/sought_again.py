@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.cameras.se3 import rotation_angle
+from relit.fit.instance_growth import ANOTHER
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_search import DETAILED, crops_of
 from relit.fit.instances import View, albedo_render, move_poses, moved_poses, pixel_bank
@@ -28,7 +29,6 @@ VIEWPOINTS = 2500
 PARTS = (0.5, 2.0, 0.6)  # weights of fit.register's descriptors that are tried beside DETAILED: one light, so brightness tells
 TRIES = 12  # places of an instance that are tried, half of them under each descriptor and these at least APART degrees from each other
 APART = 12.0
-ANOTHER = 25.0  # degrees from which on a place is another one
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
