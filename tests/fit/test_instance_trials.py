@@ -6,7 +6,7 @@ import pytest
 from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
 from relit.fit import instance_trials
-from relit.fit.instance_search import Search
+from relit.fit.instance_options import Search
 from relit.fit.instance_trials import SAME, place_few, turned_apart
 from relit.geometry.hull import NoShape
 

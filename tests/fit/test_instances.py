@@ -10,26 +10,12 @@ import pytest
 
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
-from relit.fit.instance_growth import ANOTHER, Grown, Growth, drawn, grow, lead, linked_poses
+from relit.fit.instance_growth import ANOTHER, Grown, drawn, grow, lead, linked_poses
+from relit.fit.instance_guesses import Guesses, first_pairs
 from relit.fit.instance_lookup import look_for
-from relit.fit.instance_search import (
-    DETAILED,
-    LOW,
-    Guesses,
-    Placed,
-    Search,
-    ambiguous,
-    crops_of,
-    first_pairs,
-    improved,
-    judged,
-    nearer,
-    place,
-    reconsider,
-    regrown,
-    staying,
-    trusted,
-)
+from relit.fit.instance_options import DETAILED, Growth, Search
+from relit.fit.instance_rounds import LOW, ambiguous, crops_of, reconsider, regrown, trusted
+from relit.fit.instance_search import Placed, improved, judged, nearer, place, staying
 from relit.fit.instances import (
     albedo_render,
     carved,
@@ -298,7 +284,7 @@ def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
 
 def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
     """Which, and that it is kept, by real models; what growth does is tested above."""
-    from relit.fit import instance_search
+    from relit.fit import instance_rounds
 
     views, truth = painted([0, 20, 40, 60, 80, 100])
     crops, o, said, members = crops_of(views), Search(nodes=24, steps=12), [], []
@@ -308,9 +294,9 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
         members.append(rest)
         return Grown(truth.copy(), np.ones(6), tuple(rest), 0)
 
-    monkeypatch.setattr(instance_search, "LOW", LOW / 2)  # eight colours tell less than a print
-    monkeypatch.setattr(instance_search, "grow", grown)
-    monkeypatch.setattr(instance_search, "descend", lambda v, c, r, poses, scores, *_, **__: (poses, scores))
+    monkeypatch.setattr(instance_rounds, "LOW", LOW / 2)  # eight colours tell less than a print
+    monkeypatch.setattr(instance_rounds, "grow", grown)
+    monkeypatch.setattr(instance_rounds, "descend", lambda v, c, r, poses, scores, *_, **__: (poses, scores))
     poses = truth.copy()
     for k in (1, 2):
         poses[k] = similarity(exp_so3(np.array([0.0, np.radians(110), 0.0])), np.zeros(3)) @ truth[k]
@@ -320,30 +306,30 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
 
 
 def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch):
-    from relit.fit import instance_search
+    from relit.fit import instance_rounds
 
     views, truth = painted([0, 20, 40, 60])
     crops = crops_of(views)
     rings = crop_rings(crops, DETAILED)
     for own, asked in (([0.9, 0.9, 0.85, 0.9], False), ([0.9, 0.9, 0.3, 0.9], True)):
         judged = iter([np.array(own), np.array(own) - 0.1])
-        monkeypatch.setattr(instance_search, "model_of_all", lambda *_, judged=judged, **__: (None, next(judged)))
-        monkeypatch.setattr(instance_search, "descend", lambda v, c, r, poses, scores, *_, **__: (poses + 1, scores))
-        monkeypatch.setattr(instance_search, "grow", lambda v, c, r, p, rest, poses, *_, **__: Grown(poses + 1, np.ones(len(poses)), (), 0))
+        monkeypatch.setattr(instance_rounds, "model_of_all", lambda *_, judged=judged, **__: (None, next(judged)))
+        monkeypatch.setattr(instance_rounds, "descend", lambda v, c, r, poses, scores, *_, **__: (poses + 1, scores))
+        monkeypatch.setattr(instance_rounds, "grow", lambda v, c, r, p, rest, poses, *_, **__: Grown(poses + 1, np.ones(len(poses)), (), 0))
         said: list[str] = []
         poses, _ = regrown(views, crops, rings, truth.copy(), np.ones(4), Search(), seed=0, say=said.append)
         assert np.array_equal(poses, truth) and bool(said) == asked
 
 
 def test_silhouettes_without_anything_in_common_are_left_as_they_are(monkeypatch):
-    from relit.fit import instance_search
+    from relit.fit import instance_rounds
 
     def nothing(*_, **__):
         raise NoShape("the occupancy is empty or full")
 
     views, truth = painted([0, 20, 40, 60])
     crops = crops_of(views)
-    monkeypatch.setattr(instance_search, "model_of_all", nothing)
+    monkeypatch.setattr(instance_rounds, "model_of_all", nothing)
     poses, _ = regrown(views, crops, crop_rings(crops, DETAILED), truth, np.ones(4), Search(), seed=0)
     assert np.array_equal(poses, truth)
 

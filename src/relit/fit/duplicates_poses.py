@@ -15,7 +15,8 @@ from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instance_growth import seen_from
-from relit.fit.instance_search import Search, ambiguous
+from relit.fit.instance_options import Search
+from relit.fit.instance_rounds import ambiguous
 from relit.fit.instance_trials import place_few
 from relit.fit.instances import COARSE, View, carved, views_of
 from relit.geometry.hull import NoShape
@@ -39,7 +40,7 @@ def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[
 
 def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
     """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,), unsure (N,) degrees) of all views, in the unit frame of the
-    object. unsure: see `instance_search.ambiguous`."""
+    object. unsure: see `instance_rounds.ambiguous`."""
     if run.done("poses"):
         saved = run_arrays(run, "poses", "poses")
         unsure = saved.get("unsure", np.zeros(len(saved["labels"])))
@@ -88,7 +89,7 @@ def linked_together(count: int, told: tuple) -> np.ndarray:
 
 
 def say_ambiguous(views: list[View], unsure: np.ndarray, registered: int, run) -> None:
-    """Say whose poses the pictures do not tell. unsure: (N,) degrees, see `instance_search.ambiguous`."""
+    """Say whose poses the pictures do not tell. unsure: (N,) degrees, see `instance_rounds.ambiguous`."""
     some = [named(views[k]).removeprefix("label ") for k in np.flatnonzero(unsure)]
     if some:
         run.say(

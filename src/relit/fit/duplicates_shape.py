@@ -13,7 +13,7 @@ from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import named
-from relit.fit.instance_search import Search
+from relit.fit.instance_options import Search
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
 from relit.fit.odd_instances import odd_instances, view_errors

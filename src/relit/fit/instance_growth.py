@@ -14,35 +14,12 @@ import numpy as np
 
 from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
+from relit.fit.instance_options import Growth
 from relit.fit.instances import View, albedo_render, carved, first_pose, fit_model
 from relit.fit.register import Crop, Gallery, Render, Rings, directions_around, refine, rings_of, search, views_from
 
 ANOTHER = 25.0  # degrees from which on a pose is another one
 AT_ONCE = 12  # members for each further one that may join unsure of its place at the same time: one does not spoil a model of many
-
-
-@dataclass(frozen=True)
-class Growth:
-    """How a set of placed instances grows.
-
-    nodes, steps, rate, depth: of the coarse models, as `Search`. tolerance: see `carved`; a body that is too fat agrees with wrong places
-    as well, and with more of them at every turn. viewpoints: all around. cone: degrees around what the placed ones have shown within which
-    others are looked for. keep: places of each that are refined. sure: an instance whose best place scores by so much better than any
-    other is nearly always right; while there are such, they join first. leap: spread of scores within which, where none is sure, a draw
-    decides who joins and where. astray: a member whose score lies so much below the median is taken out again.
-    """
-
-    nodes: int = 40
-    steps: int = 100
-    rate: float = 0.004
-    depth: float = 2.5
-    viewpoints: int = 600
-    cone: float = 60.0
-    keep: int = 4
-    astray: float = 0.15
-    tolerance: float = 0.15
-    sure: float = 0.06
-    leap: float = 0.015
 
 
 def seen_from(poses: np.ndarray) -> np.ndarray:

@@ -10,7 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from relit.cameras.se3 import rotation_angle
-from relit.fit.instance_search import Search, model_of_all, place
+from relit.fit.instance_options import Search
+from relit.fit.instance_rounds import model_of_all
+from relit.fit.instance_search import place
 from relit.fit.instances import View
 from relit.geometry.hull import NoShape
 
