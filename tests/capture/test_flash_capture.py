@@ -1,6 +1,7 @@
 """Flash captures: what `relit synthesize flash` writes is what the reader of IRON's layout reads; and what is wrong with such folders."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -41,6 +42,24 @@ def test_reader_and_synthesizer_agree(made):
 def test_one_folder_of_iron_alone(made):
     capture = open_capture(made / "train")
     assert capture.kind == "flash" and not capture.held_out
+
+
+def test_without_mask_files_the_sphere_is_where_the_object_is(made, tmp_path):
+    """IRON's cameras are normalised to the unit sphere by convention. Where they are not, the origin may well be in every picture; the
+    masks that the dark room gives tell where the object is."""
+    folder = tmp_path / "moved"
+    shutil.copytree(made / "train", folder)
+    shutil.rmtree(folder / "mask")
+    content, centre, scale = json.loads((folder / "cam_dict_norm.json").read_text()), np.array([1.0, 2.0, 0.5]), 3.0
+    for entry in content.values():
+        pose = np.array(entry["W2C"]).reshape(4, 4)
+        pose[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ centre
+        entry["W2C"] = pose.ravel().tolist()
+    (folder / "cam_dict_norm.json").write_text(json.dumps(content))
+    capture, before = open_capture(folder), open_capture(made / "train")
+    assert any("threshold" in note for note in capture.notes) and any("found from the masks" in note for note in capture.notes)
+    np.testing.assert_allclose(capture.sphere.centre, scale * before.sphere.centre + centre, atol=0.3 * scale)
+    assert capture.sphere.radius == pytest.approx(scale * before.sphere.radius, rel=0.3)
 
 
 def test_synthesizer_is_deterministic_and_resumes(made):

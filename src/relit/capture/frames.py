@@ -43,14 +43,16 @@ class Frame:
 
 @dataclass(frozen=True)
 class Reading:
-    """The frames of one capture, with what else the format tells. points: (N, 3) world. sphere: given by the format, or None.
-    kind: of capture, where the format tells it (see `scene.Capture`)."""
+    """The frames of one capture, with what else the format tells. points: (N, 3) world. sphere: given by the format, or None. presumed:
+    it is the format's convention and stands in no file, so masks know better. kind: of capture, where the format tells it (see
+    `scene.Capture`)."""
 
     format: str
     root: Path
     frames: tuple[Frame, ...]
     points: np.ndarray | None = None
     sphere: Sphere | None = None
+    presumed: bool = False
     notes: tuple[str, ...] = ()
     kind: str = ""
 

@@ -42,7 +42,7 @@ def read(path: Path, found: Path) -> Reading:
     if not masked and np.mean([_sees_origin(f.camera) for f in frames]) < IN_VIEW:
         sphere = None
         notes.append("the object does not stand in the unit sphere: its sphere is found anew")
-    return Reading("iron", root, tuple(frames), sphere=sphere, notes=tuple(notes), kind="flash")
+    return Reading("iron", root, tuple(frames), sphere=sphere, presumed=True, notes=tuple(notes), kind="flash")
 
 
 def _frames(file: Path, root: Path, held_out: bool) -> list[Frame]:

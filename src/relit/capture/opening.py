@@ -13,7 +13,7 @@ from relit.cameras.pinhole import lens_of
 from relit.capture import colmap_model, idr, iron, llff, middlebury, mvmc, photo, samurai, sfd, transforms_json
 from relit.capture.corrections import Corrected, corrected_masks, corrected_sphere, with_corrected_masks
 from relit.capture.frames import Frame, Reading, check_max_side
-from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
+from relit.capture.sphere import View, check_sphere, settled_sphere, up_direction
 from relit.errors import UserError, did_you_mean
 from relit.images import Header, Image, read_small
 from relit.masks.files import find_mask, index_masks, judge, read_counted
@@ -99,10 +99,9 @@ def open_capture(
         if sphere is None:
             sphere = corrected_sphere(reading.root)
             notes += ["the object sphere is the corrected one"] if sphere is not None else []
-        sphere = sphere or reading.sphere
         if sphere is None:
-            sphere, source = find_sphere([views[i] for i in train], reading.points)
-            notes.append(f"the object sphere was found from {source}")
+            sphere, source = settled_sphere(reading.sphere, reading.presumed, [views[i] for i in train], reading.points)
+            notes += [f"the object sphere was found from {source}"] if source else []
         notes += check_sphere(sphere, cameras)
         up = up_direction(cameras)
     capture = Capture(

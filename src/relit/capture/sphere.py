@@ -41,6 +41,19 @@ def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sp
     return sphere, "the cameras' viewing directions"
 
 
+def settled_sphere(known: Sphere | None, presumed: bool, views: list[View], points: np.ndarray | None = None) -> tuple[Sphere, str]:
+    """The `known` sphere and "", or as `find_sphere`. presumed: the known one is but a convention, so where all views have masks these
+    tell; the convention stands where they contradict one another. Raises UserError as `find_sphere`."""
+    if known is not None and not (presumed and all(v.mask is not None for v in views)):
+        return known, ""
+    try:
+        return find_sphere(views, points)
+    except UserError:
+        if known is None:
+            raise
+        return known, ""
+
+
 # ---------------------------------------------------------------- rays
 
 

@@ -29,6 +29,7 @@ from relit.fit.hollows import HollowOptions, open_hollows, without
 from relit.fit.kinship import start_kinship
 from relit.fit.load_photos import load_pixels
 from relit.fit.multiview import score_held_out
+from relit.fit.odd_photos import check_masks
 from relit.fit.outlines import follow_outlines
 from relit.fit.pixels import PixelBank
 from relit.fit.placing import placed_mesh
@@ -155,7 +156,7 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     else:
         model = volume_stage(bank, cameras, masks, level, coat, run, options, seed)
         score_held_out(capture, model, run, np.eye(4))
-        parts = mesh_stage(model, cameras, masks, run, options)
+        parts = mesh_stage(model, cameras, masks, [p.name for p in capture.photos], run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
@@ -265,13 +266,16 @@ def look_around(bank: PixelBank, cameras: list[Camera], model: VolumeModel, coat
     model.appearance.around = ambient.around(values, coat)
 
 
-def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: FlashOptions) -> dict[str, np.ndarray]:
+def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, names: list[str], run, options: FlashOptions) -> dict[str, np.ndarray]:
     """Mesh, its outlines where the masks have them, atlas, and what the volume pass knows of each vertex. Returns (and keeps) vertices,
-    faces, normals, uvs, albedo (V, 4: diffuse and specular), alpha (V,), offset (3,), intensity."""
+    faces, normals, uvs, albedo (V, 4: diffuse and specular), alpha (V,), offset (3,), intensity. names: of the photos."""
     with run.stage("mesh", title="mesh and atlas") as stage:
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         rounds = 0 if "refinement" in options.without else options.outlines
-        mesh, how = unwrap(follow_outlines(mesh, cameras, masks, rounds), options.texture)
+        mesh = follow_outlines(mesh, cameras, masks, rounds)
+        if note := check_masks(mesh, cameras, masks, names):
+            run.say(note)
+        mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
         learnt = np.array(model.reflections)
@@ -330,7 +334,8 @@ def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, run, 
         maps = {name: fill_gutters(picture, known) for name, picture in plastic_pictures(model.field).items()}
         maps |= {"offset": np.array(model.offset), "intensity": np.exp(np.array(model.log_intensity))}
         stage.save("maps", **maps)
-        run.say(f"flash: offset {maps['offset'].round(4).tolist()} of the object sphere's radius")
+        right, down, forward = maps["offset"]
+        run.say(f"flash: offset ({right:.4f}, {down:.4f}, {forward:.4f}) of the object sphere's radius: right, down, forward of the camera")
     return maps
 
 

@@ -26,6 +26,7 @@ from relit.fit.first_material import PAINT, describe, first_material
 from relit.fit.hollows import without
 from relit.fit.lids import FIRST, open_lids
 from relit.fit.load_photos import load_pixels
+from relit.fit.odd_photos import check_masks
 from relit.fit.outlines import follow_outlines
 from relit.fit.pixels import PixelBank, corrected, place_cameras, sphere_pixels
 from relit.fit.placing import placed_mesh
@@ -164,7 +165,7 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
     else:
         model = volume_stage(bank, cameras, masks, level, run, options, seed)
         score_held_out(capture, model, run, refined_cameras(cameras, run, options)[1])
-        parts = mesh_stage(model, cameras, masks, run, options)
+        parts = mesh_stage(model, cameras, masks, [p.name for p in capture.photos], run, options)
     cameras, parts = follow_cameras(bank, cameras, parts, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
 
@@ -277,13 +278,15 @@ def score_held_out(capture: Capture, model: VolumeModel, run, unit_from_found: n
     run.say(f"{len(scores)} photos set aside: {mean:.2f} dB ({definition})")
 
 
-def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, run, options: MultiviewOptions) -> dict[str, np.ndarray]:
+def mesh_stage(model: VolumeModel, cameras: list[Camera], masks, names: list[str], run, options: MultiviewOptions) -> dict[str, np.ndarray]:
     """Mesh, its outlines where the masks have them, or without masks no more than the photos see, atlas, and the mean radiance of each
-    vertex. Returns (and keeps) vertices, faces, normals, uvs, radiance."""
+    vertex. Returns (and keeps) vertices, faces, normals, uvs, radiance. names: of the photos."""
     with run.stage("mesh", title="mesh and atlas") as stage:
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         found = found_cameras(cameras, run, options)
         mesh = without_unseen(mesh, found) if masks is None else follow_outlines(mesh, found, masks, options.outlines)
+        if masks is not None and (note := check_masks(mesh, found, masks, names)):
+            run.say(note)
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
