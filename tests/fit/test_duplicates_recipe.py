@@ -237,7 +237,7 @@ def test_two_photos_of_one_pile(tmp_path, monkeypatch):
     told = np.concatenate([true_poses(pile, 0), true_poses(pile, 1)])
     stand_in(monkeypatch, told)
     small = {"levels": (24,), "level_steps": (6,), "rays": 256, "faces": 500, "texture": 32, "surface_steps": 2, "points": 64}
-    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48, first_material=True)
+    options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=48)
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(capture, run, options, 0)
         log = (run.folder / "log.txt").read_text()

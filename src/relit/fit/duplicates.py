@@ -25,7 +25,7 @@ from relit.errors import UserError
 from relit.fit.duplicates_options import DuplicatesOptions, options_for
 from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.duplicates_shape import shape_stages
-from relit.fit.first_material import PAINT, describe, first_material
+from relit.fit.first_material import PAINT, first_material
 from relit.fit.hidden_light import HiddenLight, hidden_from
 from relit.fit.instances import ANOTHER_PHOTO
 from relit.fit.pile_scene import (
@@ -141,11 +141,12 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         start = fill_gutters(interpolate(parts["base"], mesh.faces, face, bary), known)
         areas = vertex_areas(mesh)
         level = float((parts["radiance"].mean(0) * areas[:, None]).sum() / areas.sum() / 3)
-        traced, metallic, roughness = TraceableMesh(whole, radiance), PAINT, None
-        if options.first_material and stage.load("checkpoint") is None:
-            metallic, roughness = first_material(bank, traced, start, known, level, None, o, seed, run.progress("metal or paint"))
-            run.say(describe(metallic, roughness, known))
-        model = start_surface(start, known, level, o, None, metallic, roughness)
+        traced, metallic = TraceableMesh(whole, radiance), PAINT
+        if "first_material" not in options.without and stage.load("checkpoint") is None:
+            # metal alone: each texel stands in many places under the light here, so that roughness finds its way from anywhere
+            metallic, _ = first_material(bank, traced, start, known, level, None, o, seed, run.progress("metal or paint"))
+            run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
+        model = start_surface(start, known, level, o, None, metallic)
         if options.gaussians:
             model.gaussians = GaussianLight(options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START)
         gathered = None

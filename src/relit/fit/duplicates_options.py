@@ -14,10 +14,10 @@ class DuplicatesOptions:
     """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for all poses. levels, level_steps, rays:
     of the volume pass. refine_poses: step of the pose corrections in it (radians, unit lengths). faces, texture: of the object.
     outlines: rounds in which the poses and the mesh follow the labels (fit/outlines.py). surface_steps, points, directions, light: of the
-    surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for a map. first_material: look for metal and dull
-    paint before the surface pass (`fit.first_material`). max_pixels: of the photos. matcher: 'module:function', see `cameras.matcher`.
-    matcher_step: degrees by which it sees one picture of a pair turned, a divisor of 360 (SfD: 4, as for the built-in SIFT, which this
-    does not concern). normal_network: an ONNX file, see `capture.networks`. without: parts that are switched off, names of WITHOUT.
+    surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for a map. max_pixels: of the photos.
+    matcher: 'module:function', see `cameras.matcher`. matcher_step: degrees by which it sees one picture of a pair turned, a divisor of
+    360 (SfD: 4, as for the built-in SIFT, which this does not concern). normal_network: an ONNX file, see `capture.networks`. without:
+    parts that are switched off, names of WITHOUT.
     """
 
     side: int = 320
@@ -34,7 +34,6 @@ class DuplicatesOptions:
     directions: int = 48
     light: int = 64
     gaussians: int = 0
-    first_material: bool = False
     max_pixels: int = 4_000_000
     matcher: str = ""
     matcher_step: int = STEP
@@ -59,6 +58,7 @@ WITHOUT = {
     "visibility": "no instance, and no ground, shadows another",
     "normals": "normal priors are not used",
     "metal": "no term pulls metallic to 0 or 1",
+    "first_material": "every place begins as paint",
     "ground": "no ground is looked for",
     "hidden": "what no photo shows throws back what the volume pass makes of it, without shadows",
 }
