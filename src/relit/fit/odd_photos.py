@@ -18,7 +18,7 @@ from relit.scene import Camera, Mesh
 OVERLAP = 0.8  # less is odd; see `mask_overlaps`
 NOTHING = 0.5  # of the median photo; less, and it is no shape of the object
 LOOKED_AT = 20_000  # pixels of a photo, about
-NAMED = 3  # photos
+NAMED = 12  # photos
 
 
 def mask_overlaps(mesh: Mesh, cameras: Sequence[Camera], masks: Sequence[np.ndarray]) -> np.ndarray:
@@ -51,6 +51,6 @@ def check_masks(mesh: Mesh, cameras: Sequence[Camera], masks: Sequence[np.ndarra
     share = f"{len(odd)} of {len(overlaps)} photos"
     return (
         f"note: the shape does not fill the masks of {share} (intersection over union below {OVERLAP}: {some}): "
-        "their cameras or masks are wrong; where the object looks alike from two sides, photos of both may have been taken for one: put "
-        "something with print beside it, or give cameras"
+        "their cameras or masks are wrong, and bend the shape: leave them out, or mend their masks; where the object looks alike from two "
+        "sides, photos of both may have been taken for one: put something with print beside it, or give cameras"
     )
