@@ -80,3 +80,4 @@ def test_many_objects_and_two_are_searched_for_once(search):
         _, said, seeds = search([poses(0, count)], [], count)
         assert seeds == [7] and not said
     assert search([poses(0)], [], descents=0)[2] == [7]  # an ablation
+    assert search([poses(0)], [], searches=1)[2] == [7]  # draft

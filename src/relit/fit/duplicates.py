@@ -54,7 +54,7 @@ LIGHT = "several identical objects under one light are assumed (duplicates)"  # 
 STAGES = ("poses", "joint", "volume", "mesh", "surface")
 FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
-COST = {"draft": (60.0, 1.0e9), "standard": (350.0, 2.0e9), "high": (1200.0, 3.0e9)}
+COST = {"draft": (240.0, 1.9e9), "standard": (540.0, 2.0e9), "high": (1500.0, 3.0e9)}  # ten objects; most of it is the search for poses
 
 
 def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0) -> Asset:

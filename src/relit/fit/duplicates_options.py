@@ -11,17 +11,20 @@ from relit.settings import check_parts, preset
 
 @dataclass(frozen=True)
 class DuplicatesOptions:
-    """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for all poses. levels, level_steps, rays:
-    of the volume pass. refine_poses: step of the pose corrections in it (radians, unit lengths). faces, texture: of the object.
-    outlines: rounds in which the poses and the mesh follow the labels (fit/outlines.py). surface_steps, points, directions, light: of the
-    surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for a map. max_pixels: of the photos.
-    matcher: 'module:function', see `cameras.matcher`. matcher_step: degrees by which it sees one picture of a pair turned, a divisor of
-    360 (SfD: 4, as for the built-in SIFT, which this does not concern). normal_network: an ONNX file, see `capture.networks`. without:
-    parts that are switched off, names of WITHOUT.
+    """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for all poses. searches: of few objects (up
+    to 8) from the start, until two of them agree. regrowths: times that objects which were not sure of their places are taken out and join
+    again. levels, level_steps, rays: of the volume pass. refine_poses: step of the pose corrections in it (radians, unit lengths). faces,
+    texture: of the object. outlines: rounds in which the poses and the mesh follow the labels (fit/outlines.py). surface_steps, points,
+    directions, light: of the surface pass. gaussians: the light is so many spherical Gaussians (SfD: 128), 0 for a map. max_pixels: of the
+    photos. matcher: 'module:function', see `cameras.matcher`. matcher_step: degrees by which it sees one picture of a pair turned, a
+    divisor of 360 (SfD: 4, as for the built-in SIFT, which this does not concern). normal_network: an ONNX file, see `capture.networks`.
+    without: parts that are switched off, names of WITHOUT.
     """
 
     side: int = 320
     search_rounds: int = 1
+    searches: int = 3
+    regrowths: int = 12
     levels: tuple[int, ...] = (48, 96, 192)
     level_steps: tuple[int, ...] = (400, 500, 400)
     rays: int = 6144
@@ -66,6 +69,8 @@ WITHOUT = {
 PRESETS = {
     "draft": {
         "side": 200,
+        "searches": 1,
+        "regrowths": 4,
         "levels": (48, 96),
         "level_steps": (150, 200),
         "rays": 4096,

@@ -48,7 +48,8 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
     views = all_views(shots, COARSE, options)
     with run.stage("poses", title="poses of the instances") as stage:
         matched = None if "matching" in options.without else match_instances(shots, run, options, seed)
-        search = Search(rounds=options.search_rounds, **({"descents": 0} if "refinement" in options.without else {}))
+        descents = {"descents": 0} if "refinement" in options.without else {}
+        search = Search(rounds=options.search_rounds, searches=options.searches, regrowths=options.regrowths, **descents)
         try:
             poses, scores = place_few(views, search, seed=seed, links=matched.told if matched else (), say=run.say)
         except NoShape:

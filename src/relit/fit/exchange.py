@@ -16,6 +16,7 @@ from relit.conventions import environment_directions, environment_solid_angles
 from relit.fit.loop import Adam
 
 ROWS = 16  # of the table of normals, and of the light that it is made for
+BLACK = 1e-4  # base colour that cannot become darker
 REFRESH = 20  # steps after which the table follows the light
 
 
@@ -66,9 +67,12 @@ class Exchange:
             dr.scatter_add(gradient, g * weight, index)
         base, pull = dr.unravel(mi.Vector4f, colour), dr.unravel(mi.Vector4f, colour_gradient)
         besides = mi.Float(0) if metallic is None else mirrored(base.w) * (1 - metallic)
-        whole = mi.Color3f(base.x, base.y, base.z) + besides
+        own, wish = mi.Color3f(base.x, base.y, base.z), mi.Color3f(pull.x, pull.y, pull.z)
+        whole = own + besides
+        # paint that is black and would be darker has nothing left to give: light that grows on its account would only brighten it
+        spent = (own <= BLACK) & (wish > 0)
         binned = dr.zeros(mi.Float, 3 * bins)
-        dr.scatter_add(binned, mi.Color3f(whole.x * pull.x, whole.y * pull.y, whole.z * pull.z), self.bin)
+        dr.scatter_add(binned, dr.select(spent, 0, whole * wish), self.bin)
         i = dr.arange(mi.UInt32, lanes * bins)
         b, lane = i % bins, i // bins
         k, c = lane // 3, lane % 3
@@ -83,7 +87,7 @@ class Exchange:
         k, lane = i % n, i // n
         terms = dr.gather(mi.Float, move, k * 3 + lane % 3) * dr.gather(mi.Float, self.share, (lane // 3) * n + k)
         factor = dr.gather(mi.Color3f, dr.exp(-dr.block_sum(terms, n)), self.bin)
-        whole = whole * factor - besides
+        whole = dr.select(spent, own, whole * factor - besides)
         return dr.ravel(mi.Vector4f(whole.x, whole.y, whole.z, base.w)), log_light
 
 

@@ -39,10 +39,11 @@ class Search:
     nodes, steps: of the coarse models, a side and of each fit. viewpoints: all around. cone: degrees from what a single instance has shown
     within which another can be recognised. models: instances that are inflated, at most. keep: guesses for each pair. starts: pairs that
     poses are grown from, at most, for each descriptor. leaps: share of the instances that may have been unsure of their places in what is
-    believed at once. regrowths, idle: times that instances are grown again where it is not, at most, and in a row without gain. rounds: of
-    fit and search for all instances. descents, descent_rate: fits of shape and poses together that follow, and the step of the poses in
-    them. rate: of the pose corrections in other coarse fits. depth: see `carved`. doubted, rounds_doubted: instances that are searched once
-    more against a model of the others, and how often at most. late: descents that follow where one has moved, at most.
+    believed at once. searches: of few instances, until two come to the same poses. regrowths, idle: times that instances are grown again
+    where it is not, at most, and in a row without gain. rounds: of fit and search for all instances. descents, descent_rate: fits of shape
+    and poses together that follow, and the step of the poses in them. rate: of the pose corrections in other coarse fits. depth: see
+    `carved`. doubted, rounds_doubted: instances that are searched once more against a model of the others, and how often at most. late:
+    descents that follow where one has moved, at most.
     """
 
     nodes: int = 40
@@ -53,6 +54,7 @@ class Search:
     keep: int = 2
     starts: int = 2
     leaps: float = 0.1
+    searches: int = 3
     regrowths: int = 12
     idle: int = 5
     rounds: int = 1

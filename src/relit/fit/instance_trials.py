@@ -17,32 +17,31 @@ from relit.fit.instances import View
 from relit.geometry.hull import NoShape
 
 FEW = 8  # objects up to which one search is not enough
-TRIALS = 3
 SAME = 15.0  # degrees within which two searches have put all objects alike
 
 
 def place_few(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None) -> tuple[np.ndarray, np.ndarray]:
-    """`place`, for few objects several times: poses (N, 4, 4) and scores (N,). Raises NoShape as that where every search fails."""
-    if not 2 < len(views) <= FEW or not o.descents:
+    """`place`, for few objects up to `o.searches` times: poses (N, 4, 4) and scores (N,). Raises NoShape where every search does."""
+    if not 2 < len(views) <= FEW or not o.descents or o.searches < 2:
         return place(views, o, seed=seed, links=links, say=say)
     found: list[tuple[float, np.ndarray, np.ndarray]] = []
-    for trial in range(TRIALS):
+    for trial in range(o.searches):
         try:
             poses, scores = place(views, o, seed=seed + 1000 * trial, links=links, say=say)
         except NoShape:
-            if trial == TRIALS - 1 and not found:
+            if trial == o.searches - 1 and not found:
                 raise
             continue
         _, own = model_of_all(views, poses, o, seed=seed)
         agreement = float(own.mean())
         like = [other for other in found if turned_apart(poses, other[1]) < SAME]
         found.append((agreement, poses, scores))
-        say(f"search {trial + 1} of at most {TRIALS}: agreement of all with a model of all {agreement:.3f}")
+        say(f"search {trial + 1} of at most {o.searches}: agreement of all with a model of all {agreement:.3f}")
         if like:
             say("two searches have come to the same poses")
             return max([*like, found[-1]], key=lambda one: one[0])[1:]
     agreement, poses, scores = max(found, key=lambda one: one[0])
-    say(f"note: no two of {TRIALS} searches come to the same poses: the best is taken (agreement {agreement:.3f}); look at the result")
+    say(f"note: no two of {o.searches} searches come to the same poses: the best is taken (agreement {agreement:.3f}); look at the result")
     return poses, scores
 
 
