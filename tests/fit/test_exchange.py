@@ -105,19 +105,6 @@ def test_what_is_mirrored_counts_as_reflectance():
     assert not still[:, :3].any()
 
 
-def test_black_paint_that_would_be_darker_gives_nothing():
-    """Its wish cannot be granted, so it must not make the light grow; and what else moves the light leaves it black."""
-    exchange, _, light, colour = start()
-    colour[:40, :3] = 0.0
-    g_colour = np.zeros_like(colour)
-    g_colour[:40, :3] = 0.1
-    g_colour[40:, 1] = 1e-4  # paint that has something to give still counts
-    after_colour, after = move(exchange, light, colour, np.zeros_like(light), g_colour, metallic=mi.Float(0.0))
-    c = np.log(after / light)
-    np.testing.assert_allclose(c, np.broadcast_to([0.0, 0.02, 0.0], c.shape), atol=1e-4)
-    assert not after_colour[:40, :3].any() and (after_colour[40:, 1] < colour[40:, 1]).all()
-
-
 @pytest.mark.parametrize("roughness", [0.15, 0.3, 0.5, 0.7, 1.0])
 def test_mirrored_is_what_black_paint_reflects_under_even_light(roughness):
     """Over views that stand on the hemisphere by their cosine; directions of the light by mirrors drawn from GGX."""

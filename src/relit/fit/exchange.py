@@ -16,7 +16,6 @@ from relit.conventions import environment_directions, environment_solid_angles
 from relit.fit.loop import Adam
 
 ROWS = 16  # of the table of normals, and of the light that it is made for
-BLACK = 1e-4  # base colour that cannot become darker
 REFRESH = 20  # steps after which the table follows the light
 
 
@@ -67,12 +66,9 @@ class Exchange:
             dr.scatter_add(gradient, g * weight, index)
         base, pull = dr.unravel(mi.Vector4f, colour), dr.unravel(mi.Vector4f, colour_gradient)
         besides = mi.Float(0) if metallic is None else mirrored(base.w) * (1 - metallic)
-        own, wish = mi.Color3f(base.x, base.y, base.z), mi.Color3f(pull.x, pull.y, pull.z)
-        whole = own + besides
-        # paint that is black and would be darker has nothing left to give: light that grows on its account would only brighten it
-        spent = (own <= BLACK) & (wish > 0)
+        whole = mi.Color3f(base.x, base.y, base.z) + besides
         binned = dr.zeros(mi.Float, 3 * bins)
-        dr.scatter_add(binned, dr.select(spent, 0, whole * wish), self.bin)
+        dr.scatter_add(binned, mi.Color3f(whole.x * pull.x, whole.y * pull.y, whole.z * pull.z), self.bin)
         i = dr.arange(mi.UInt32, lanes * bins)
         b, lane = i % bins, i // bins
         k, c = lane // 3, lane % 3
@@ -87,7 +83,7 @@ class Exchange:
         k, lane = i % n, i // n
         terms = dr.gather(mi.Float, move, k * 3 + lane % 3) * dr.gather(mi.Float, self.share, (lane // 3) * n + k)
         factor = dr.gather(mi.Color3f, dr.exp(-dr.block_sum(terms, n)), self.bin)
-        whole = dr.select(spent, own, whole * factor - besides)
+        whole = whole * factor - besides
         return dr.ravel(mi.Vector4f(whole.x, whole.y, whole.z, base.w)), log_light
 
 
