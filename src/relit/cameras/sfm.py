@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from relit.cameras.strays import stray_photos
 from relit.capture.colmap_model import camera_from_colmap, sparse_points, world_from_camera
 from relit.capture.photo import with_camera
 from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
@@ -127,10 +128,16 @@ def find_cameras(
             "take sharp photos that overlap by two thirds, with texture in view (a newspaper under a plain object), or give cameras",
             code=EXIT_FAILED,
         )
-    verdict = Verdict(best.count, len(photos), reason, best.error, tuple(tries), seconds)
-    sphere, source = _sphere(best.model, names, small)
-    result = _registered(capture, best.model, sphere, source, verdict)  # may raise: then nothing is kept
-    _keep(workdir, key, best.model, sphere, source, verdict)
+    strays, points = _strays(best.model, names, small)
+    if strays:
+        named = ", ".join(photos[names.index(n)].name for n in strays)
+        text = f"{len(strays)} were put where they were not taken ({named}): what the others see of the object lies beside their masks"
+        reason = f"{reason}; {text}" if reason else text
+    verdict = Verdict(best.count - len(strays), len(photos), reason, best.error, tuple(tries), seconds)
+    sphere, source = _sphere(best.model, names, small, strays, points)
+    model = _Model(best.model, tuple(strays), points)
+    result = _registered(capture, model, sphere, source, verdict)  # may raise: then nothing is kept
+    _keep(workdir, key, model, sphere, source, verdict)
     return result, verdict
 
 
@@ -321,12 +328,33 @@ def _write_photos(photos: list[Photo], workdir: Path) -> tuple[list[str], list[f
     return names, scales, small
 
 
-def _sphere(model, names: list[str], small: list[np.ndarray | None]) -> tuple[Sphere, str]:
+@dataclass(frozen=True)
+class _Model:
+    """What was found. strays: image names of `model` that are left out. points: (N, 3) on the object, or None."""
+
+    model: object
+    strays: tuple[str, ...]
+    points: np.ndarray | None
+
+
+def _strays(model, names: list[str], small: list[np.ndarray | None]) -> tuple[list[str], np.ndarray | None]:
+    """Image names of photos that were put where they were not taken, and the sparse points without theirs."""
     masks = dict(zip(names, small, strict=True))
     images = [model.image(i) for i in model.reg_image_ids()]
+    points = sparse_points(model)
+    if any(masks[i.name] is None for i in images):
+        return [], points
+    cameras = [camera_from_colmap(i.camera, world_from_camera(i))[0] for i in images]
+    odd, agreed = stray_photos(cameras, [masks[i.name] for i in images], points)
+    return sorted(images[k].name for k in odd), None if points is None else points[agreed]
+
+
+def _sphere(model, names: list[str], small: list[np.ndarray | None], strays: list[str], points) -> tuple[Sphere, str]:
+    masks = dict(zip(names, small, strict=True))
+    images = [i for i in map(model.image, model.reg_image_ids()) if i.name not in strays]
     views = [View(*camera_from_colmap(i.camera, world_from_camera(i)), masks[i.name]) for i in images]
     try:
-        return find_sphere(views, sparse_points(model))
+        return find_sphere(views, points)
     except UserError as error:  # its advice is about given poses; these were found
         raise UserError(
             f"{error.what}; the cameras were found from the photos",
@@ -336,9 +364,9 @@ def _sphere(model, names: list[str], small: list[np.ndarray | None]) -> tuple[Sp
         ) from None
 
 
-def _registered(capture: Capture, model, sphere: Sphere, source: str, verdict: Verdict) -> Capture:
+def _registered(capture: Capture, found: _Model, sphere: Sphere, source: str, verdict: Verdict) -> Capture:
     """The capture with the cameras of a model; photo i is the model's image '0000i.png'."""
-    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    images = {i.name: i for i in map(found.model.image, found.model.reg_image_ids()) if i.name not in found.strays}
     kept = []
     for i, p in enumerate(capture.photos):
         image = images.get(_name(i))
@@ -346,18 +374,19 @@ def _registered(capture: Capture, model, sphere: Sphere, source: str, verdict: V
             kept.append(with_camera(p, *camera_from_colmap(image.camera, world_from_camera(image))))
     cameras = [p.camera for p in kept]
     notes = [*capture.notes, f"cameras: {verdict}", f"the object sphere was found from {source}", *check_sphere(sphere, cameras)]
-    points = sparse_points(model)
-    return replace(capture, photos=tuple(kept), sphere=sphere, points=points, up=up_direction(cameras), notes=tuple(notes))
+    return replace(capture, photos=tuple(kept), sphere=sphere, points=found.points, up=up_direction(cameras), notes=tuple(notes))
 
 
 def _name(index: int) -> str:
     return f"{index:05d}.png"
 
 
-def _keep(workdir: Path, key: list, model, sphere: Sphere, source: str, verdict: Verdict) -> None:
+def _keep(workdir: Path, key: list, found: _Model, sphere: Sphere, source: str, verdict: Verdict) -> None:
     """Store what was found; `found.json` comes last, so that it never speaks of a model that is not whole."""
-    model.write_binary(str(workdir / "model"))
-    record = {"key": key, "centre": sphere.centre.tolist(), "radius": sphere.radius, "source": source, "verdict": asdict(verdict)}
+    found.model.write_binary(str(workdir / "model"))
+    points = None if found.points is None else found.points.tolist()
+    record = {"strays": found.strays, "points": points}
+    record |= {"key": key, "centre": sphere.centre.tolist(), "radius": sphere.radius, "source": source, "verdict": asdict(verdict)}
     write_bytes(workdir / "found.json", json.dumps(record).encode())
     for name in ("images", "masks", "tries"):
         shutil.rmtree(workdir / name, ignore_errors=True)
@@ -373,7 +402,9 @@ def _kept(workdir: Path, key: list):
             return None
         verdict = Verdict(**{**record["verdict"], "tries": tuple(record["verdict"]["tries"])})
         sphere = Sphere(np.array(record["centre"], dtype=np.float64), float(record["radius"]))
-        return pycolmap.Reconstruction(str(workdir / "model")), sphere, str(record["source"]), verdict
+        points = None if record["points"] is None else np.array(record["points"], dtype=np.float64)
+        model = _Model(pycolmap.Reconstruction(str(workdir / "model")), tuple(record["strays"]), points)
+        return model, sphere, str(record["source"]), verdict
     except (OSError, ValueError, KeyError, TypeError, RuntimeError):
         return None  # nothing there, or a damaged record: the search starts again
 
