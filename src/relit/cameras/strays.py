@@ -29,15 +29,20 @@ def stray_photos(cameras: Sequence[Camera], masks: Sequence[np.ndarray], points:
     """
     if points is None or len(points) < LEAST_POINTS:
         return [], np.ones(0 if points is None else len(points), bool)
+    nobody = [], np.ones(len(points), bool)
     held = np.array([holds(camera, mask, points) for camera, mask in zip(cameras, masks, strict=True)])
-    agreed = held.mean(0) >= AGREED
-    if agreed.sum() < LEAST_POINTS:
-        return [], np.ones(len(points), bool)
-    share = held[:, agreed].mean(1)
-    odd = np.flatnonzero(share < HELD)
-    if np.median(share) < USUAL or not 0 < len(odd) <= MOST * len(cameras):
-        return [], np.ones(len(points), bool)
-    return odd.tolist(), agreed
+    here = np.ones(len(cameras), bool)
+    while True:  # without the strays more points are agreed on, and those show strays that hid among them
+        agreed = held[here].mean(0) >= AGREED
+        if agreed.sum() < LEAST_POINTS:
+            return nobody
+        share = held[:, agreed].mean(1)
+        still = here & (share >= HELD)
+        if np.median(share[here]) < USUAL or (~still).sum() > MOST * len(cameras):
+            return nobody
+        if (still == here).all():
+            return np.flatnonzero(~here).tolist(), agreed if not here.all() else nobody[1]
+        here = still
 
 
 def holds(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
