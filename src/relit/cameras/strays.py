@@ -14,11 +14,13 @@ import numpy as np
 
 from relit.scene import Camera
 
-AGREED = 0.8  # share of the photos whose masks hold a point of the object; other points are background, or the strays' own
-HELD = 0.7  # share of these points that the mask of a photo in its place holds: masks may miss a dark side
+AGREED = 0.8  # share of the photos that should show a point of the object whose masks hold it; others are background, or the strays' own
+HELD = 0.7  # share of the points it should show that the mask of a photo in its place holds: masks may miss a dark side
 USUAL = 0.9  # the same of the median photo: below it masks or points tell nothing
 MOST = 0.2  # share of the photos; where more disagree, there is no telling who is wrong
 LEAST_POINTS = 100
+LEAST_SHOWN = 30  # of them in a photo that is judged
+LEAST_PHOTOS = 3  # that hold a point
 
 
 def stray_photos(cameras: Sequence[Camera], masks: Sequence[np.ndarray], points: np.ndarray | None) -> tuple[list[int], np.ndarray]:
@@ -30,13 +32,14 @@ def stray_photos(cameras: Sequence[Camera], masks: Sequence[np.ndarray], points:
     if points is None or len(points) < LEAST_POINTS:
         return [], np.ones(0 if points is None else len(points), bool)
     nobody = [], np.ones(len(points), bool)
-    held = np.array([holds(camera, mask, points) for camera, mask in zip(cameras, masks, strict=True)])
+    seen, held = np.moveaxis([shown(camera, mask, points) for camera, mask in zip(cameras, masks, strict=True)], 1, 0)
     here = np.ones(len(cameras), bool)
     while True:  # without the strays more points are agreed on, and those show strays that hid among them
-        agreed = held[here].mean(0) >= AGREED
+        agreed = held[here].sum(0) >= np.maximum(AGREED * seen[here].sum(0), LEAST_PHOTOS)
         if agreed.sum() < LEAST_POINTS:
             return nobody
-        share = held[:, agreed].mean(1)
+        due = seen[:, agreed].sum(1)
+        share = np.where(due >= LEAST_SHOWN, held[:, agreed].sum(1) / np.maximum(due, 1), 1.0)
         still = here & (share >= HELD)
         if np.median(share[here]) < USUAL or (~still).sum() > MOST * len(cameras):
             return nobody
@@ -45,12 +48,15 @@ def stray_photos(cameras: Sequence[Camera], masks: Sequence[np.ndarray], points:
         here = still
 
 
-def holds(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 3) that a camera sees inside its mask (h, w), grown by two pixels."""
+def shown(camera: Camera, mask: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool each: points (N, 3) that a photo should show if they are on the object, and those that lie inside its mask (h, w), grown by
+    two pixels. Where the mask reaches the border, as in a close-up, these are the points in its frame; else the whole object is."""
     h, w = mask.shape
-    grown = cv2.dilate((mask > 0.3).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    solid = mask > 0.3
+    whole = not (solid[[0, -1]].any() or solid[:, [0, -1]].any())
+    grown = cv2.dilate(solid.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     u, v, depth = camera.resized(w, h).project(points).T
     inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < w) & (v < h)
-    out = np.zeros(len(points), bool)
-    out[inside] = grown[v[inside].astype(int), u[inside].astype(int)]
-    return out
+    held = np.zeros(len(points), bool)
+    held[inside] = grown[v[inside].astype(int), u[inside].astype(int)]
+    return inside | whole, held
