@@ -7,6 +7,7 @@ from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
 from relit.fit import instance_trials
 from relit.fit.instance_options import Search
+from relit.fit.instance_search import Found
 from relit.fit.instance_trials import SAME, place_few, turned_apart
 from relit.geometry.hull import NoShape
 
@@ -34,7 +35,7 @@ def test_a_turn_of_the_whole_is_no_difference():
 def search(monkeypatch):
     """search(results, agreements, count) -> (poses, what was said, seeds): with what each search finds, or an error of its."""
 
-    def run(results, agreements, count=6, **options):
+    def run(results, agreements, count=6, sure=False, **options):
         said, seeds, left, told = [], [], list(results), list(agreements)
 
         def place(views, o, *, seed, links, say):
@@ -42,7 +43,7 @@ def search(monkeypatch):
             one = left.pop(0)
             if isinstance(one, Exception):
                 raise one
-            return one, np.full(len(one), 0.9)
+            return Found(one, np.full(len(one), 0.9), sure)
 
         monkeypatch.setattr(instance_trials, "place", place)
         monkeypatch.setattr(instance_trials, "model_of_all", lambda *_, **__: (None, np.full(count, told.pop(0))))
@@ -59,6 +60,11 @@ def test_two_searches_that_agree_are_believed_against_a_better_score(search):
     assert "same poses" in said[-1]
     _, _, seeds = search([right, turned(right, [1.0, 0, 0])], [0.95, 0.95])
     assert len(seeds) == 2  # a third is not needed
+
+
+def test_a_search_that_is_sure_of_all_places_is_not_repeated(search):
+    got, said, seeds = search([poses(0)], [], sure=True)
+    assert np.array_equal(got, poses(0)) and seeds == [7] and not said
 
 
 def test_where_none_agree_the_best_is_taken_and_said(search):

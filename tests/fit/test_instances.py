@@ -10,12 +10,13 @@ import pytest
 
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
-from relit.fit.instance_growth import ANOTHER, Grown, drawn, grow, lead, linked_poses
+from relit.fit.instance_growth import ANOTHER, Grown, grow, lead, linked_poses
 from relit.fit.instance_guesses import Guesses, first_pairs
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Growth, Search
-from relit.fit.instance_rounds import LOW, ambiguous, crops_of, reconsider, regrown, trusted
-from relit.fit.instance_search import Placed, improved, judged, nearer, place, staying
+from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged, staying
+from relit.fit.instance_rounds import LOW, ambiguous, crops_of, nearer, reconsider, regrown, settled, trusted
+from relit.fit.instance_search import place
 from relit.fit.instances import (
     albedo_render,
     carved,
@@ -124,19 +125,13 @@ def test_a_place_leads_over_those_that_are_turned_and_not_over_its_own_neighbour
     places = np.array([[similarity(exp_so3(np.array([0, np.radians(a), 0])), np.zeros(3))] for a in turns])
     assert lead(places, np.array([[0.9], [0.89], [0.8], [0.7]])) == pytest.approx([0.1])
     assert lead(places, np.array([[0.6], [0.5], [0.55], [0.9]])) == pytest.approx([0.3])
-    scores = np.array([[0.5, 0.9], [0.88, 0.2]])
-    assert drawn(scores, 0.02, None) == (0, 1)
-    rng = np.random.default_rng(0)
-    picks = [drawn(scores, 0.02, rng) for _ in range(300)]
-    share = picks.count((0, 1)) / 300
-    assert set(picks) == {(0, 1), (1, 0)} and share == pytest.approx(1 / (1 + np.exp(-1)), abs=0.08)
 
 
 def test_those_stay_that_were_sure_that_agree_and_that_see_one_side():
     angles, rng = np.arange(10) * 36.0, np.random.default_rng(0)
     poses = np.array([similarity(np.eye(3), 5 * np.array([np.cos(a), 0, np.sin(a)])) for a in np.radians(angles)])
     own = np.array([0.9] * 5 + [0.2] * 5)
-    placed = Placed(poses, own, (3, 7, 1), 5, DETAILED)
+    placed = Placed(poses, own, (3, 7, 1), (0, 2, 4, 5, 6), DETAILED)
     for turn in range(12):
         stay = staying(placed, turn, rng)
         if turn % 2 == 0:
@@ -153,7 +148,7 @@ def test_those_stay_that_were_sure_that_agree_and_that_see_one_side():
 
 def test_growing_again_ends_with_the_best_agreement(monkeypatch):
     """With growth that puts those right that join, as long as all that stay are; the judge is real."""
-    from relit.fit import instance_search
+    from relit.fit import instance_regrowth
 
     views, truth = painted([0, 20, 40, 60, 80, 100])
     wrong = similarity(exp_so3(np.array([0.0, np.radians(110), 0.0])), np.zeros(3))
@@ -165,15 +160,65 @@ def test_growing_again_ends_with_the_best_agreement(monkeypatch):
         rest = [k for k in range(6) if k not in stay]
         poses = poses.copy()
         poses[rest] = truth[rest] if right else start[rest]
-        return Grown(poses, np.ones(6), tuple(stay), len(rest))
+        return Grown(poses, np.ones(6), tuple(stay), tuple(rest))
 
-    monkeypatch.setattr(instance_search, "grow", grown)
+    monkeypatch.setattr(instance_regrowth, "grow", grown)
     crops, said = crops_of(views), []
     rings, o = crop_rings(crops, DETAILED), Search(nodes=24, steps=12, regrowths=12, idle=12)
-    begun = judged(views, Grown(start, np.ones(6), (0, 1), 4), DETAILED, o, 0)
+    begun = judged(views, Grown(start, np.ones(6), (0, 1), (2, 3, 4, 5)), DETAILED, o, 0)
     best = improved(views, crops, rings, begun, o, seed=0, say=said.append)
     assert np.array_equal(best.poses, truth) and best.agreement > begun.agreement + 0.02
-    assert any("grown again" in text for text in said) and best.leaps > 0
+    assert any("grown again" in text for text in said) and best.unsure
+
+
+def test_what_is_believed_was_sure_of_its_places_and_agrees_all_over():
+    own, o = np.full(10, 0.9), Search()
+    placed = Placed(np.tile(np.eye(4), (10, 1, 1)), own, (0, 1), (4,), DETAILED)
+    assert believed(placed, o) and not believed(None, o)
+    assert not believed(replace(placed, unsure=(4, 5)), o)
+    assert not believed(replace(placed, own=np.where(np.arange(10) == 3, 0.9 - 1.1 * LOW, own)), o)
+
+
+def test_those_who_were_unsure_are_asked_again_once_all_others_stand(monkeypatch):
+    from relit.fit import instance_regrowth
+
+    views, truth = painted([0, 20, 40, 60, 80, 100])
+    crops, o, asked = crops_of(views), Search(nodes=24, steps=12), []
+
+    def grown(views, crops, rings, parts, stay, poses, *_, **__):
+        asked.append(stay)
+        return Grown(truth.copy(), np.ones(6), tuple(stay), ())
+
+    monkeypatch.setattr(instance_regrowth, "grow", grown)
+    begun = judged(views, Grown(truth, np.ones(6), (0, 1), (2, 4)), DETAILED, o, 0)
+    rings = crop_rings(crops, DETAILED)
+    after = confirmed(views, crops, rings, begun, o, seed=0)
+    assert asked == [[0, 1, 3, 5]] and after.unsure == () and believed(after, o)
+    assert confirmed(views, crops, rings, after, o, seed=0) is after and len(asked) == 1  # nothing to ask
+    few = replace(begun, unsure=(1, 2, 3, 4))
+    assert confirmed(views, crops, rings, few, o, seed=0) is few and len(asked) == 1  # too few would be left
+
+
+def test_what_doubt_moves_is_kept_only_where_all_agree_no_worse(monkeypatch):
+    from relit.fit import instance_rounds
+
+    views, truth = painted([0, 20, 40, 60])
+    crops, sent, asked = crops_of(views), truth + 1, []
+    rings = crop_rings(crops, DETAILED)
+
+    def doubt(views, crops, rings, poses, scores, o, *, sure, **__):
+        asked.append(set(sure))
+        return (sent, scores, [2]) if 2 not in sure else (poses, scores, [])
+
+    for name in ("settle", "descend", "regrown"):
+        monkeypatch.setattr(instance_rounds, name, lambda v, c, r, poses, scores, *_, **__: (poses, scores))
+    monkeypatch.setattr(instance_rounds, "reconsider", doubt)
+    for levels, moved in (([0.9, 0.8], False), ([0.9, 0.95], True)):
+        told = iter(levels)
+        monkeypatch.setattr(instance_rounds, "agreement_of", lambda *_, told=told: next(told, 0.95))
+        poses, _ = settled(views, crops, rings, truth.copy(), np.ones(4), Search(rounds_doubted=2), seed=0)
+        assert np.array_equal(poses, sent if moved else truth)
+    assert asked[:2] == [set(), {2}]  # who was brought back is not asked again
 
 
 def test_a_link_from_matching_gives_a_pose_from_either_side():
@@ -235,12 +280,12 @@ def test_an_instance_joins_those_that_stand_and_poses_wait_for_the_shape():
     views, truth = painted([0, 20, 40])
     parts = (0.6, 2.0, 0.1)
     crops = crops_of(views)
-    o = Growth(nodes=24, steps=12, viewpoints=300, keep=1, cone=45.0)
+    o = Growth(nodes=24, steps=12, viewpoints=300, keep=1)
     start = truth.copy()
     start[2] = np.eye(4)
     grown = grow(views, crops, crop_rings(crops, parts), parts, [0, 1], start, o)
     poses, scores = grown.poses, grown.scores
-    assert set(grown.firm) >= {0, 1} and len(grown.firm) + grown.leaps == 3
+    assert set(grown.firm) >= {0, 1} and len(grown.firm) + len(grown.unsure) == 3
     assert rotation_angle(poses[2][:3, :3].T @ truth[2][:3, :3] @ (poses[0][:3, :3].T @ truth[0][:3, :3]).T) < 15
     assert scores.min() > 0.8
     values = carved(views, truth, 24, 0.0)
@@ -253,14 +298,15 @@ def test_poses_are_found_from_silhouettes_and_colours_alone():
     small = {"nodes": 24, "steps": 16, "viewpoints": 200}
     o = Search(**small, models=1, starts=1, descents=1, leaps=-1.0, growth=Growth(**small, keep=1))
     said = []
-    poses, scores = place(views, o, say=said.append)
+    found = place(views, o, say=said.append)
+    poses, scores = found.poses, found.scores
     for k in (1, 2):
         turn, true = (p[k][:3, :3].T @ p[0][:3, :3] for p in (poses, truth))
         assert rotation_angle(turn.T @ true) < 20
     assert scores.shape == (3,) and scores.min() > 0.7
-    assert any("uncertain" in text for text in said)
-    alone, score = place(views[:1], o)
-    assert alone.shape == (1, 4, 4) and score.tolist() == [1.0]
+    assert any("uncertain" in text for text in said) and not found.sure
+    alone = place(views[:1], o)
+    assert alone.poses.shape == (1, 4, 4) and alone.scores.tolist() == [1.0] and alone.sure
 
 
 def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
@@ -292,7 +338,7 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
     def grown(views, crops, rings, parts, rest, poses, *_, **__):
         assert parts == DETAILED
         members.append(rest)
-        return Grown(truth.copy(), np.ones(6), tuple(rest), 0)
+        return Grown(truth.copy(), np.ones(6), tuple(rest), ())
 
     monkeypatch.setattr(instance_rounds, "LOW", LOW / 2)  # eight colours tell less than a print
     monkeypatch.setattr(instance_rounds, "grow", grown)
@@ -315,7 +361,9 @@ def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch
         judged = iter([np.array(own), np.array(own) - 0.1])
         monkeypatch.setattr(instance_rounds, "model_of_all", lambda *_, judged=judged, **__: (None, next(judged)))
         monkeypatch.setattr(instance_rounds, "descend", lambda v, c, r, poses, scores, *_, **__: (poses + 1, scores))
-        monkeypatch.setattr(instance_rounds, "grow", lambda v, c, r, p, rest, poses, *_, **__: Grown(poses + 1, np.ones(len(poses)), (), 0))
+        monkeypatch.setattr(
+            instance_rounds, "grow", lambda v, c, r, p, rest, poses, *_, **__: Grown(poses + 1, np.ones(len(poses)), (), ())
+        )
         said: list[str] = []
         poses, _ = regrown(views, crops, rings, truth.copy(), np.ones(4), Search(), seed=0, say=said.append)
         assert np.array_equal(poses, truth) and bool(said) == asked

@@ -8,15 +8,16 @@ from motion, and each that joins makes the model better for the next; where none
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
+from relit.fit.instance_lookahead import branch_values
 from relit.fit.instance_options import Growth
 from relit.fit.instances import View, albedo_render, carved, first_pose, fit_model
-from relit.fit.register import Crop, Gallery, Render, Rings, directions_around, refine, rings_of, search, views_from
+from relit.fit.register import Crop, Gallery, Render, Rings, chosen_rings, directions_around, refine, rings_of, search, views_from
 
 ANOTHER = 25.0  # degrees from which on a pose is another one
 AT_ONCE = 12  # members for each further one that may join unsure of its place at the same time: one does not spoil a model of many
@@ -31,12 +32,12 @@ def seen_from(poses: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class Grown:
     """What growth has given. poses: (N, 4, 4), scores: (N,) of all instances. firm: those that stood or joined before the first that was
-    not sure of its place. leaps: how many were not."""
+    not sure of its place. unsure: those that were not."""
 
     poses: np.ndarray
     scores: np.ndarray
     firm: tuple[int, ...]
-    leaps: int
+    unsure: tuple[int, ...]
 
 
 def grow(
@@ -59,12 +60,12 @@ def grow(
     """
     poses, scores = np.array(poses, np.float64), np.full(len(views), -1.0)
     members, expelled, turn = list(members), Counter(), 0
-    firm, leaps = list(members), 0
+    firm, unsure = list(members), []
     while True:
         turn += 1
         some = [views[k] for k in members]
         values = carved(some, poses[members], o.nodes, o.tolerance, o.depth, crossed=len(members) > 3)
-        model, poses[members] = fit_model(some, poses[members], values, o.steps, refine_cameras=o.rate, seed=seed)
+        model, poses[members] = fit_model(some, poses[members], values, o.steps, refine_cameras=o.rate, rays=o.rays, seed=seed)
         render = albedo_render(model)
         poses[members], scores[members] = refine(
             [crops[k] for k in members], poses[members], render, rings=chosen_rings(rings, members), steps=(0, 4.0, 2.0), parts=parts
@@ -76,22 +77,22 @@ def grow(
             members = [k for k in members if k not in astray]
         rest = [k for k in range(len(views)) if k not in members]
         if not rest:
-            return Grown(poses, scores, tuple(dict.fromkeys(k for k in firm if k in members)), leaps)  # some left and came back
+            return Grown(poses, scores, tuple(dict.fromkeys(k for k in firm if k in members)), tuple(unsure))  # some left and came back
         places, heights = registered(views, crops, rings, parts, render, poses, members, rest, o, seed + turn, links)
         best = heights.argmax(0)
         margins = lead(places, heights)
         order = sorted(range(len(rest)), key=lambda i: -margins[i])
         join = [i for i in order if margins[i] >= o.sure][: max(1, len(members) // 2)]
-        if not join:
-            place, first = drawn(heights, o.leap, rng)
+        leap = not join
+        if leap:
+            place, first = ahead(views, crops, rings, parts, members, poses, rest, places, heights, o, seed + turn, rng)
             best[first] = place
             others = [i for i in np.argsort(-heights.max(0)).tolist() if i != first]
             join = [first, *others[: len(members) // AT_ONCE]]
-            leaps += len(join)
-        elif not leaps:
-            firm += [rest[i] for i in join]
-        for i in join:
-            k = rest[i]
+        joined = [rest[i] for i in join]
+        unsure = [k for k in unsure if k not in joined] + (joined if leap else [])  # some come back, and are sure then
+        firm += [] if unsure else joined
+        for i, k in zip(join, joined, strict=True):
             poses[k], scores[k] = places[best[i], i], heights[best[i], i]
             members.append(k)
 
@@ -106,23 +107,28 @@ def lead(places: np.ndarray, heights: np.ndarray) -> np.ndarray:
     return out
 
 
-def drawn(heights: np.ndarray, spread: float, rng) -> tuple[int, int]:
-    """(place, instance) of scores (K, R): the best, or where there is an rng one that it draws, the likelier the better its score."""
-    if rng is None:
-        at = int(heights.argmax())
-    else:
-        p = np.exp((heights - heights.max()) / spread).ravel()
-        at = int(rng.choice(heights.size, p=p / p.sum()))
-    place, instance = divmod(at, heights.shape[1])
-    return place, instance
+def ahead(views, crops, rings: Rings, parts, members, poses, rest, places, heights, o: Growth, seed: int, rng) -> tuple[int, int]:
+    """(place, instance of `rest`) after which all others agree best, of the `o.ahead` whose scores are best (see `branch_values`); an rng
+    draws, the likelier the better."""
+    tried = [divmod(int(at), heights.shape[1]) for at in np.argsort(-heights, axis=None)[: o.ahead] if heights.flat[at] > -1]
+    if len(rest) == 1:
+        return tried[0]
+    branches = []
+    for place, i in tried:
+        joined = poses.copy()
+        joined[rest[i]] = places[place, i]
+        branches.append(([*members, rest[i]], joined))
+    value = branch_values(views, crops, rings, parts, branches, o, seed)
+    if rng is not None:
+        value = value + o.leap * rng.gumbel(size=len(value))
+    return tried[int(value.argmax())]
 
 
 def registered(views, crops, rings: Rings, parts, render: Render, poses, members: list[int], rest: list[int], o: Growth, seed: int, links):
     """Places (K, R, 4, 4) of `rest` against the model of `members` and their scores (K, R): what near-by viewpoints show and links say."""
     far = float(np.median(np.linalg.norm(poses[members][:, :3, 3], axis=1)))
     directions = directions_around(o.viewpoints, seed)
-    close = (directions @ seen_from(poses[members]).T).max(1) > np.cos(np.radians(o.cone))
-    cameras = views_from(directions[close], far)
+    cameras = views_from(directions, far)
     rgb, alpha = render(cameras)
     theirs, some = chosen_rings(rings, rest), [crops[k] for k in rest]
     # not look_for: what is hidden in part would fit early, and wrongly
@@ -143,8 +149,3 @@ def linked_poses(views, poses, members: list[int], rest: list[int], links, dista
             own = poses[i][:3, :3] @ turn.T
             out[j] = similarity(own, own @ first_pose(views[j], distance)[:3, 3])
     return out
-
-
-def chosen_rings(rings: Rings, chosen: list[int]) -> Rings:
-    """The rings of some of the pictures."""
-    return Rings(*(getattr(rings, f.name)[chosen] for f in fields(Rings)))

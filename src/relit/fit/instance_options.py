@@ -13,10 +13,11 @@ class Growth:
     """How a set of placed instances grows.
 
     nodes, steps, rate, depth: of the coarse models, as `Search`. tolerance: see `carved`; a body that is too fat agrees with wrong places
-    as well, and with more of them at every turn. viewpoints: all around. cone: degrees around what the placed ones have shown within which
-    others are looked for. keep: places of each that are refined. sure: an instance whose best place scores by so much better than any
-    other is nearly always right; while there are such, they join first. leap: spread of scores within which, where none is sure, a draw
-    decides who joins and where. astray: a member whose score lies so much below the median is taken out again.
+    as well, and with more of them at every turn. rays: of a step of a fit. viewpoints: all around. keep: places of each that are refined.
+    sure: an instance whose best place scores by so much better than any other is nearly always right; while there are such, they join
+    first. ahead, ahead_steps, ahead_views: where there are none, so many ways to join are tried, each with a fit of so many steps and so
+    many views of it (fit/instance_lookahead.py). leap: spread of their values within which a draw decides, when instances are grown again.
+    astray: a member whose score lies so much below the median is taken out again.
     """
 
     nodes: int = 40
@@ -24,12 +25,15 @@ class Growth:
     rate: float = 0.004
     depth: float = 2.5
     viewpoints: int = 600
-    cone: float = 60.0
-    keep: int = 4
+    keep: int = 5
     astray: float = 0.15
     tolerance: float = 0.15
+    rays: int = 2048
+    ahead: int = 14
+    ahead_steps: int = 40
+    ahead_views: int = 300
     sure: float = 0.06
-    leap: float = 0.015
+    leap: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -37,13 +41,13 @@ class Search:
     """How poses are searched.
 
     nodes, steps: of the coarse models, a side and of each fit. viewpoints: all around. cone: degrees from what a single instance has shown
-    within which another can be recognised. models: instances that are inflated, at most. keep: guesses for each pair. starts: pairs that
-    poses are grown from, at most, for each descriptor. leaps: share of the instances that may have been unsure of their places in what is
-    believed at once. searches: of few instances, until two come to the same poses. regrowths, idle: times that instances are grown again
-    where it is not, at most, and in a row without gain. rounds: of fit and search for all instances. descents, descent_rate: fits of shape
-    and poses together that follow, and the step of the poses in them. rate: of the pose corrections in other coarse fits. depth: see
-    `carved`. doubted, rounds_doubted: instances that are searched once more against a model of the others, and how often at most. late:
-    descents that follow where one has moved, at most.
+    within which another can be recognised. models: instances that are inflated, at most. keep: guesses for each pair. pairs: that are tried
+    by what becomes of the others (fit/instance_lookahead.py). starts: of these that poses are grown from, at most, for each descriptor.
+    leaps: share of the instances that may have been unsure of their places in what is believed. searches: of few instances, until two come
+    to the same poses. regrowths, idle: times that instances are grown again where it is not, at most, and in a row without gain. rounds: of
+    fit and search for all instances. descents, descent_rate: fits of shape and poses together that follow, and the step of the poses in
+    them. rate: of the pose corrections in other coarse fits. depth: see `carved`. doubted, rounds_doubted: instances that are searched once
+    more against a model of the others, and how often at most. late: descents that follow where one has moved, at most.
     """
 
     nodes: int = 40
@@ -52,6 +56,7 @@ class Search:
     cone: float = 65.0
     models: int = 14
     keep: int = 2
+    pairs: int = 8
     starts: int = 2
     leaps: float = 0.1
     searches: int = 3

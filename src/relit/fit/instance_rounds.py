@@ -10,17 +10,19 @@ from __future__ import annotations
 import numpy as np
 
 from relit.cameras.se3 import rotation_angle
-from relit.fit.instance_growth import ANOTHER, chosen_rings, grow
+from relit.fit.instance_growth import ANOTHER, grow
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instances import View, albedo_render, carved, fit_model
-from relit.fit.register import Crop, crop_photo, crop_rings, directions_around, make_gallery, refine, views_from
+from relit.fit.register import Crop, chosen_rings, crop_photo, crop_rings, directions_around, make_gallery, refine, views_from
 from relit.geometry.hull import NoShape
 
 UNSURE = 0.3  # see `ambiguous`
 GAP = 0.1  # an instance's score may lie so much below those of the best third
 LOW = 0.1  # see `regrown`: so much below the median
 REGROWN = 2  # times at most
+STILL = 0.5  # degrees; descents that turn instances by less have arrived
+SLACK = 0.005  # of the mean agreement by which two fits of the same poses may differ
 
 
 def crops_of(views: list[View]) -> list[Crop]:
@@ -75,6 +77,50 @@ def descend(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=D
     poses[others] = again[others]
     say(f"shape and poses together: mean score {scores.mean():.3f}, lowest {scores.min():.3f}")
     return poses, scores
+
+
+def settled(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=DETAILED, say=lambda text: None):
+    """Poses that have grown, made exact, and doubted; (poses, scores). What doubt moves is kept where all agree no worse for it."""
+    poses, scores = settle(views, crops, rings, poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
+    poses, scores = descend(views, crops, rings, poses, scores, o, seed=seed + 20, parts=parts, say=say)
+    poses, scores = regrown(views, crops, rings, poses, scores, o, seed=seed + 100, parts=parts, say=say)
+    if not o.descents or len(views) < 3 or not o.rounds_doubted:
+        return poses, scores
+    detail = crop_rings(crops, DETAILED)  # colour alone puts a spotted cow on any of its white sides
+    late, sure, agreement = False, set(), agreement_of(views, poses, o, seed)
+    for turn in range(o.rounds_doubted):
+        sent, _, moved = reconsider(
+            views, crops, detail, poses.copy(), scores, o, seed=seed + 30 + turn, parts=DETAILED, sure=sure, say=say
+        )
+        if not moved:
+            break
+        again, level = descend(views, crops, rings, sent.copy(), scores, o, seed=seed + 40 + turn, parts=parts, say=say)
+        better = agreement_of(views, again, o, seed)
+        if better < agreement - SLACK:
+            say(f"all agree less for it ({agreement:.3f} -> {better:.3f}): they stay where they were")
+            sure |= set(moved)
+            continue
+        sure |= {k for k in moved if nearer(again[k], poses[k], sent[k])}  # brought back: asked again, they would be sent again
+        late, poses, scores, agreement = True, again, level, max(agreement, better)
+    for turn in range(o.late if late else 0):  # those that came late have had the fewest descents, and hold the others back
+        before = poses.copy()
+        poses, scores = descend(views, crops, rings, poses, scores, o, seed=seed + 50 + turn, parts=parts, say=say)
+        if np.median([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(before, poses, strict=True)]) < STILL:
+            break
+    return regrown(views, crops, rings, poses, scores, o, seed=seed + 200, parts=parts, say=say) if late else (poses, scores)
+
+
+def agreement_of(views, poses: np.ndarray, o: Search, seed: int) -> float:
+    """Mean score of all against a model of all; 0 where the silhouettes have nothing in common."""
+    try:
+        return float(model_of_all(views, poses, o, seed=seed)[1].mean())
+    except NoShape:
+        return 0.0
+
+
+def nearer(pose: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether a pose (4, 4) is turned less against a than against b."""
+    return rotation_angle(pose[:3, :3].T @ a[:3, :3]) < rotation_angle(pose[:3, :3].T @ b[:3, :3])
 
 
 def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=DETAILED, sure=frozenset(), say=lambda text: None):

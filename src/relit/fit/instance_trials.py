@@ -1,8 +1,9 @@
 """The search of few identical objects, repeated from the start.
 
-Of six objects two in wrong places can bear each other out: the model of all takes them up, and no score within one search tells. Another
-seed begins from other viewpoints and ends elsewhere, unless the poses are right: searches that come to the same poses are believed, and
-where no two do, the one whose objects agree best with a model of all of them.
+Of six objects two in wrong places can bear each other out: the model of all takes them up, and no score within one search tells. A search
+in which nearly all were sure of their places is believed. Otherwise another seed begins from other viewpoints and ends elsewhere, unless
+the poses are right: searches that come to the same poses are believed, and where no two do, the one whose objects agree best with a model
+of all of them.
 """
 
 from __future__ import annotations
@@ -23,15 +24,19 @@ SAME = 15.0  # degrees within which two searches have put all objects alike
 def place_few(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None) -> tuple[np.ndarray, np.ndarray]:
     """`place`, for few objects up to `o.searches` times: poses (N, 4, 4) and scores (N,). Raises NoShape where every search does."""
     if not 2 < len(views) <= FEW or not o.descents or o.searches < 2:
-        return place(views, o, seed=seed, links=links, say=say)
+        one = place(views, o, seed=seed, links=links, say=say)
+        return one.poses, one.scores
     found: list[tuple[float, np.ndarray, np.ndarray]] = []
     for trial in range(o.searches):
         try:
-            poses, scores = place(views, o, seed=seed + 1000 * trial, links=links, say=say)
+            one = place(views, o, seed=seed + 1000 * trial, links=links, say=say)
         except NoShape:
             if trial == o.searches - 1 and not found:
                 raise
             continue
+        poses, scores = one.poses, one.scores
+        if one.sure:
+            return poses, scores
         _, own = model_of_all(views, poses, o, seed=seed)
         agreement = float(own.mean())
         like = [other for other in found if turned_apart(poses, other[1]) < SAME]

@@ -15,13 +15,13 @@ may be unknown (outside the frame, behind something else): they carry weight 0.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.fft import irfft, rfft
 
 from relit.cameras.se3 import exp_so3, look_at, rotation_angle, rotation_from
 from relit.conventions import similarity
@@ -192,14 +192,16 @@ def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None
     turn = np.arange(TURNS) * (2 * np.pi / TURNS)
     x = centre[:, 0, None, None] + spread[:, None, None] * radius[:, None] * np.cos(turn)
     y = centre[:, 1, None, None] + spread[:, None, None] * radius[:, None] * np.sin(turn)
-    n = np.broadcast_to(np.arange(len(mask))[:, None, None], x.shape)
+    at = np.stack([x, y], -1).astype(np.float32) - 0.5  # cv2's pixel centres lie at whole numbers
 
-    def look(a, outside=0.0):
-        return map_coordinates(a, [n, y - 0.5, x - 0.5], np.float32, order=1, mode="constant", cval=outside)
+    def look(pictures):
+        return np.stack(
+            [cv2.remap(p, m, None, cv2.INTER_LINEAR) for p, m in zip(np.ascontiguousarray(pictures, np.float32), at, strict=True)]
+        )
 
-    a = look(mask)
-    w = np.ones_like(a) if weight is None else look(np.asarray(weight, np.float32))
-    colour = np.stack([look(np.ascontiguousarray(rgb[..., c], np.float32) * mask) for c in range(3)], -1)
+    seen = look(np.concatenate([mask[..., None], np.asarray(rgb, np.float32) * mask[..., None]], -1))
+    a, colour = seen[..., 0], seen[..., 1:]
+    w = np.ones_like(a) if weight is None else look(weight)
     area = w * radius[:, None].astype(np.float32)
     inside = (a > 0.5) * area
     total = np.maximum(inside.sum((1, 2)), 1e-6)
@@ -219,7 +221,7 @@ def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None
     weighted = f * area[..., None]
 
     def spectrum(g):
-        return np.moveaxis(np.fft.rfft(g, axis=2), 2, 1).reshape(len(g), TURNS // 2 + 1, -1).astype(np.complex64)
+        return np.moveaxis(rfft(g, axis=2), 2, 1).reshape(len(g), TURNS // 2 + 1, -1).astype(np.complex64)
 
     squares = (f * f).sum(-1)
     norm = np.sqrt((squares * area).sum((1, 2)))
@@ -233,10 +235,16 @@ def detail(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
     level = rgb.mean(-1) / np.maximum(mask, 0.05) * inside
     usual = np.maximum(level.sum((1, 2)) / count, 1e-4)
     bright = np.log(level / usual[:, None, None] + 0.1) * inside
-    around = gaussian_filter(bright, (0, FINE, FINE)) / np.maximum(gaussian_filter(inside, (0, FINE, FINE)), 1e-3)
+    around = blurred(bright) / np.maximum(blurred(inside), 1e-3)
     fine = (bright - around) * inside
     deviation = np.sqrt((fine**2).sum((1, 2)) / count)
     return np.clip(fine / (deviation[:, None, None] + 0.03), -2.5, 2.5).astype(np.float32)
+
+
+def blurred(pictures: np.ndarray) -> np.ndarray:
+    """(N, S, S) smoothed by FINE pixels."""
+    size = 2 * round(4 * FINE) + 1
+    return np.stack([cv2.GaussianBlur(p, (size, size), FINE, borderType=cv2.BORDER_REFLECT) for p in pictures])
 
 
 def moments(known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -262,13 +270,13 @@ def all_scores(photos: Rings, views: Rings) -> np.ndarray:
 def _correlate(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """(P, V, TURNS) from spectra (P, F, J), (V, F, J): entry s sums p(θ + s) q(θ)."""
     product = np.matmul(p.transpose(1, 0, 2), q.conj().transpose(1, 2, 0))  # (F, P, V)
-    return np.fft.irfft(product, TURNS, axis=0).transpose(1, 2, 0).astype(np.float32)
+    return irfft(product, TURNS, axis=0).transpose(1, 2, 0).astype(np.float32)
 
 
 def pair_scores(photos: Rings, views: Rings, photo: np.ndarray) -> np.ndarray:
     """(V, TURNS): view i against photo[i] only."""
-    top = np.fft.irfft((photos.spectrum[photo] * views.plain.conj()).sum(-1), TURNS, axis=1)
-    below = np.fft.irfft((photos.weights[photo] * views.squares.conj()).sum(-1), TURNS, axis=1)
+    top = irfft((photos.spectrum[photo] * views.plain.conj()).sum(-1), TURNS, axis=1)
+    below = irfft((photos.weights[photo] * views.squares.conj()).sum(-1), TURNS, axis=1)
     return (top / (photos.norm[photo, None] * np.sqrt(np.maximum(below, 1e-6)) + 1e-9)).astype(np.float32)
 
 
@@ -322,6 +330,11 @@ def crop_views(crops: list[Crop], poses: np.ndarray) -> list[Camera]:
 def crop_rings(crops: list[Crop], parts=PARTS) -> Rings:
     """What is compared of the crops; compute once, they do not change."""
     return rings_of(*(np.stack([getattr(c, name) for c in crops]) for name in ("rgb", "mask", "weight")), parts=parts)
+
+
+def chosen_rings(rings: Rings, chosen: list[int]) -> Rings:
+    """The rings of some of the pictures."""
+    return Rings(*(getattr(rings, f.name)[chosen] for f in fields(Rings)))
 
 
 def search(
