@@ -16,7 +16,7 @@ from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Growth, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged, staying
 from relit.fit.instance_rounds import LOW, ambiguous, crops_of, nearer, reconsider, regrown, settled, trusted
-from relit.fit.instance_search import place
+from relit.fit.instance_search import first_starts, linked_sets, place
 from relit.fit.instances import (
     albedo_render,
     carved,
@@ -235,6 +235,49 @@ def test_a_link_from_matching_gives_a_pose_from_either_side():
         middle = CAMERA.with_pose(found[1]).project(np.zeros((1, 3)))[0]
         assert np.allclose(middle[:2], [150.5, 60.5], atol=0.6) and middle[2] == pytest.approx(5.0, rel=0.02)
     assert linked_poses(views, np.stack([placed, np.eye(4)]), [0], [1], [], 5.0) == {}
+
+
+def test_what_matching_links_twice_alike_is_one_set_to_grow_from():
+    labels = np.zeros((120, 200), np.int32)
+    for k in range(5):
+        cv2.circle(labels, (25 + 36 * k, 60), 12, k + 1, -1)
+    views = views_of(np.zeros((120, 200, 3), np.float32), labels, CAMERA, 10**6)
+    turns = exp_so3_of([[0, 0, 0], [0.2, 0.1, 0], [0, -0.5, 0.3], [0.9, 0, 0], [0, 0, 1.2]])  # photo_from_object
+    link = lambda i, j, more=0.0: (i, j, exp_so3(np.array([0, more, 0])) @ turns[j] @ turns[i].T)  # noqa: E731
+    # 3 is linked with two of them by turns that do not agree, and 4 by one link only
+    links = [link(0, 1), link(0, 2), link(2, 1), link(0, 3), link(3, 1, 1.0), link(3, 4)]
+    sets = linked_sets(views, links, 5.0)
+    assert [members for members, _ in sets] == [[0, 1, 2], [0, 3], [3, 1], [3, 4]]
+    poses = sets[0][1]
+    for k in (1, 2):
+        assert np.allclose(poses[k][:3, :3].T, turns[k] @ turns[0].T, atol=1e-6)
+        middle = CAMERA.with_pose(poses[k]).project(np.zeros((1, 3)))[0]
+        assert np.allclose(middle[:2], [25.5 + 36 * k, 60.5], atol=0.6)
+    assert linked_sets(views, [], 5.0) == []
+
+
+def test_growth_begins_with_the_best_guess_and_the_best_link(monkeypatch):
+    from relit.fit import instance_search
+
+    labels = np.zeros((120, 200), np.int32)
+    for k in range(4):
+        cv2.circle(labels, (30 + 40 * k, 60), 12, k + 1, -1)
+    views = views_of(np.zeros((120, 200, 3), np.float32), labels, CAMERA, 10**6)
+    scores = np.full((2, 4, 2), -1.0)
+    scores[0, 1], scores[0, 2], scores[1, 3] = [0.9, 0.5], [0.9, 0.6], [0.9, 0.7]
+    guesses = Guesses(np.tile(np.eye(4), (2, 4, 2, 1, 1)), scores)
+    values = {(0, 1): 0.1, (0, 2): 0.3, (1, 3): 0.2, (2, 3): -0.1}
+    told = lambda v, c, r, p, branches, o, seed: np.array([values[tuple(members)] for members, _ in branches])  # noqa: E731
+    monkeypatch.setattr(instance_search, "branch_values", told)
+    begun = lambda links: [m for m, _ in first_starts(views, None, None, None, guesses, [0, 1], links, Search(pairs=3), 0)]  # noqa: E731
+    assert begun(()) == [[0, 2], [1, 3], [0, 1]]
+    assert begun([(2, 3, np.eye(3))]) == [[0, 2], [2, 3], [1, 3], [0, 1]]
+    values[2, 3] = 0.9
+    assert begun([(2, 3, np.eye(3))]) == [[2, 3], [0, 2], [1, 3], [0, 1]]
+
+
+def exp_so3_of(axes) -> np.ndarray:
+    return np.array([exp_so3(np.array(w, float)) for w in axes])
 
 
 def test_views_across_bound_what_one_leaves_open_in_depth():

@@ -146,6 +146,11 @@ def linked_poses(views, poses, members: list[int], rest: list[int], links, dista
     out = {}
     for i, j, turn in (*links, *((j, i, turn.T) for i, j, turn in links)):
         if i in members and j in rest and j not in out:
-            own = poses[i][:3, :3] @ turn.T
-            out[j] = similarity(own, own @ first_pose(views[j], distance)[:3, 3])
+            out[j] = linked_pose(views[j], poses[i], turn, distance)
     return out
+
+
+def linked_pose(view: View, pose: np.ndarray, turn: np.ndarray, distance: float) -> np.ndarray:
+    """Pose of `view`, in the middle of its silhouette, turned in the photo by `turn` against an instance in `pose`."""
+    own = pose[:3, :3] @ turn.T
+    return similarity(own, own @ first_pose(view, distance)[:3, 3])

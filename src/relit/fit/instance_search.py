@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relit.fit.instance_growth import grow
+from relit.cameras.se3 import rotation_angle
+from relit.fit.instance_growth import grow, linked_pose
 from relit.fit.instance_guesses import Guesses, first_pairs, pair_guesses
 from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
@@ -21,6 +22,8 @@ from relit.fit.instance_rounds import crops_of, settled
 from relit.fit.instances import View, first_pose, frame_scale
 from relit.fit.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
+
+ALIKE = 15.0  # degrees within which links tell the same turn
 
 
 @dataclass(frozen=True)
@@ -34,16 +37,43 @@ class Found:
 
 
 def first_starts(views, crops, rings: Rings, parts, guesses: Guesses, chosen: list[int], links, o: Search, seed: int) -> list[Branch]:
-    """Pairs to grow from, as branches, those first after which all others agree best: of the guesses with the largest margins, and of what
-    matching says."""
-    branches = []
+    """What to grow from: pairs, of the guesses with the largest margins, and what matching has linked. Those first after which all others
+    agree best (see `branch_values`), but the best of either kind among the first two."""
+    distance, guessed = frame_scale(views), []
     for s, j in first_pairs(guesses, chosen, o.pairs):
         poses = np.tile(np.eye(4), (len(views), 1, 1))
         pair = [chosen[s], j]
         poses[pair] = guesses.poses[s, pair, 0]
-        branches.append((pair, poses))
-    value = branch_values(views, crops, rings, parts, branches, o.growth, seed)
-    return [branches[b] for b in np.argsort(-value, kind="stable")]
+        guessed.append((pair, poses))
+    told = linked_sets(views, links, distance)[: o.pairs]
+    value = branch_values(views, crops, rings, parts, [*guessed, *told], o.growth, seed)
+    order = np.argsort(-value, kind="stable").tolist()
+    kinds = [b >= len(guessed) for b in order]
+    if len(set(kinds)) == 2:
+        other = order[kinds.index(not kinds[0])]
+        order = [order[0], other, *(b for b in order[1:] if b != other)]
+    return [[*guessed, *told][b] for b in order]
+
+
+def linked_sets(views, links, distance: float) -> list[Branch]:
+    """Sets of instances that links of matching join, the largest first: each begins with a link, and who joins has links to two members
+    or more that tell the same turn. A link whose instances a set holds is not begun from again."""
+    either = [*links, *((j, i, turn.T) for i, j, turn in links)]
+    sets: list[Branch] = []
+    for first, second, turn in links:
+        if any({first, second} <= set(members) for members, _ in sets):
+            continue
+        poses = np.tile(np.eye(4), (len(views), 1, 1))
+        poses[first] = first_pose(views[first], distance)
+        poses[second] = linked_pose(views[second], poses[first], turn, distance)
+        members = [first, second]
+        for k in range(len(views)):
+            ways = [linked_pose(views[k], poses[i], r, distance) for i, j, r in either if j == k and i in members and k not in members]
+            if len(ways) > 1 and all(rotation_angle(ways[0][:3, :3].T @ w[:3, :3]) < ALIKE for w in ways[1:]):
+                poses[k] = ways[0]
+                members.append(k)
+        sets.append((members, poses))
+    return sorted(sets, key=lambda one: -len(one[0]))
 
 
 def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None, step=lambda done, total: None) -> Found:
@@ -66,9 +96,9 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         for parts in starts:
             if turn >= len(starts[parts]) or believed(best, o):
                 continue
-            pair, poses = starts[parts][turn]
+            start, poses = starts[parts][turn]
             try:
-                grown = grow(views, crops, rings[parts], parts, pair, poses, o.growth, seed=seed, links=links)
+                grown = grow(views, crops, rings[parts], parts, start, poses, o.growth, seed=seed, links=links)
             except NoShape:  # the silhouettes have nothing in common
                 continue
             placed = judged(views, grown, parts, o, seed)
@@ -76,7 +106,7 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
                 continue
             placed = confirmed(views, crops, rings[parts], placed, o, seed=seed, links=links)
             say(
-                f"grown from {views[pair[0]].label} and {views[pair[1]].label}: {len(views) - len(placed.unsure)} sure of their places, "
+                f"grown from {' and '.join(str(views[k].label) for k in start)}: {len(views) - len(placed.unsure)} sure of their places, "
                 f"agreement of all with a model of all {placed.agreement:.3f}"
             )
             if best is None or believed(placed, o) or placed.agreement > best.agreement:
