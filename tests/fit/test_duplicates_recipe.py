@@ -227,6 +227,28 @@ def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
     assert "does not agree with the model of all" in (run.folder / "log.txt").read_text()
 
 
+def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
+    """Who is left out of one pass is not in the next; at most PASSES are made."""
+    asked = []
+
+    def stage(views, poses, name, number, run, options, seed):
+        asked.append((name, list(views)))
+        odd = np.array([v == "b" for v in views])
+        return poses + np.where(odd, 0, 1)[:, None, None], odd, number < arrives
+
+    monkeypatch.setattr(shape, "joint_stage", stage)
+    start = np.zeros((3, 4, 4))
+    arrives = 2
+    poses, odd = shape.joint_stages(["a", "b", "c"], start, None, None, 0)
+    assert [name for name, _ in asked] == ["joint", "joint_2", "joint_3"]
+    assert [some for _, some in asked] == [["a", "b", "c"], ["a", "c"], ["a", "c"]]
+    assert odd.tolist() == [False, True, False] and poses[:, 0, 0].tolist() == [3, 0, 3] and not start.any()
+    asked.clear()
+    arrives = 99
+    shape.joint_stages(["a", "b", "c"], start, None, None, 0)
+    assert len(asked) == shape.PASSES
+
+
 def test_two_photos_of_one_pile(tmp_path, monkeypatch):
     write_glb(tmp_path / "pawn.glb", *pawn(rows=12, columns=16, texture=16))
     write_linear(tmp_path / "light.exr", np.full((8, 16, 3), 0.7, np.float32))

@@ -14,6 +14,7 @@ from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import named
 from relit.fit.instance_options import Search
+from relit.fit.instance_trials import apart
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
 from relit.fit.odd_instances import odd_instances, view_errors
@@ -32,6 +33,8 @@ from relit.run import run_arrays
 from relit.scene import Mesh
 
 HOLD = 40  # steps of a volume pass of one level before poses move
+PASSES, ORDINALS = 4, ("first", "second", "third", "fourth")  # volume passes for the poses alone, at most
+ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last one
 
 
 def shape_stages(
@@ -100,14 +103,29 @@ def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: Dup
     return mesh, poses, bool(said)
 
 
-def joint_stage(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool) after a first volume pass. What it gives is thrown away but for the poses, and which instances show what does
-    not agree with the model of all: a shape that grew up with better poses is sharper, and moves them on. Textures are asked here already:
-    what the pass has built in the wrong place it does not take back."""
-    if run.done("joint"):
-        saved = run_arrays(run, "joint", "joint")
-        return saved["poses"], saved["odd"]
-    with run.stage("joint", steps=sum(options.level_steps), title="shape and poses (first pass)") as stage:
+def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
+    """(poses, odd (N,) bool) after a first volume pass, and others while textures say that poses are still on their way (at most PASSES):
+    what each gives is thrown away but for the poses, and which instances show what does not agree with the model of all. A shape that grew
+    up with better poses is sharper, and moves them on."""
+    poses, odd = poses.copy(), np.zeros(len(views), bool)
+    for number in range(PASSES):
+        rest = np.flatnonzero(~odd)
+        name = "joint" if number == 0 else f"joint_{number + 1}"
+        poses[rest], odd[rest], again = joint_stage([views[k] for k in rest], poses[rest], name, number, run, options, seed)
+        if not again:
+            break
+    return poses, odd
+
+
+def joint_stage(views: list[View], poses: np.ndarray, name: str, number: int, run, options: DuplicatesOptions, seed: int):
+    """(poses, odd (N,) bool, again) after one such pass. Textures are asked here already: what the pass has built in the wrong place it
+    does not take back. again: they did not agree with poses that follow the labels alone, and the pass has turned the instances."""
+    if run.done(name):
+        saved = run_arrays(run, name, "joint")
+        return saved["poses"], saved["odd"], bool(saved.get("again", False))
+    title = f"shape and poses ({ORDINALS[number]} pass)"
+    with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
+        before, disagree = poses, False
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed)
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
@@ -116,15 +134,16 @@ def joint_stage(views: list[View], poses: np.ndarray, run, options: DuplicatesOp
             mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
             _, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
             poses[~odd] = moved if disagree else poses[~odd]
-        stage.save("joint", poses=poses, odd=odd)
-    return poses, odd
+        again = disagree and float(np.median(apart(before[~odd], poses[~odd]))) > ARRIVED
+        stage.save("joint", poses=poses, odd=odd, again=again)
+    return poses, odd, again
 
 
 def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):
-    """(views, poses, model) after the volume pass, from the poses of a first one. Instances that do not agree with that one's model are
+    """(views, poses, model) after the volume pass, from the poses of the first ones. Instances that do not agree with their model are
     left out; they, and `others`, which the search could not place, are then sought in the finished model."""
     if pose_rate(views, options) > 0:
-        poses, odd = joint_stage(views, poses, run, options, seed)
+        poses, odd = joint_stages(views, poses, run, options, seed)
         others = [*others, *(views[k] for k in np.flatnonzero(odd))]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
