@@ -65,5 +65,7 @@ def test_who_joins_is_decided_by_what_becomes_of_the_others(monkeypatch):
     assert ahead(*rings, [0], poses, rest, places, heights, Growth(ahead=2), 0, None) == (0, 1)
     drawn = {ahead(*rings, [0], poses, rest, places, heights, Growth(leap=0.1), 0, np.random.default_rng(s)) for s in range(40)}
     assert len(drawn) == 3
+    nowhere = np.full((2, 1), -1.0)  # a search that finds nothing gives its first place
+    assert ahead(*rings, [0, 2], poses, [1], places[:, :1], nowhere, Growth(), 0, None) == (0, 0)
     count = len(seen)
     assert ahead(*rings, [0, 2], poses, [1], places[:, :1], heights[:, :1], Growth(), 0, None) == (0, 0) and len(seen) == count

@@ -339,7 +339,7 @@ def test_an_instance_joins_those_that_stand_and_poses_wait_for_the_shape():
 def test_poses_are_found_from_silhouettes_and_colours_alone():
     views, truth = painted([0, 20, 40])
     small = {"nodes": 24, "steps": 16, "viewpoints": 200}
-    o = Search(**small, models=1, starts=1, descents=1, leaps=-1.0, growth=Growth(**small, keep=1))
+    o = Search(**small, models=1, starts=1, descents=1, leaps=-1.0, growth=Growth(**small, keep=1, rays=4096))
     said = []
     found = place(views, o, say=said.append)
     poses, scores = found.poses, found.scores

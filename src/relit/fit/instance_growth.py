@@ -110,7 +110,9 @@ def lead(places: np.ndarray, heights: np.ndarray) -> np.ndarray:
 def ahead(views, crops, rings: Rings, parts, members, poses, rest, places, heights, o: Growth, seed: int, rng) -> tuple[int, int]:
     """(place, instance of `rest`) after which all others agree best, of the `o.ahead` whose scores are best (see `branch_values`); an rng
     draws, the likelier the better."""
-    tried = [divmod(int(at), heights.shape[1]) for at in np.argsort(-heights, axis=None)[: o.ahead] if heights.flat[at] > -1]
+    order = np.argsort(-heights, axis=None)[: o.ahead]
+    found = [at for at in order if heights.flat[at] > -1] or order[:1]
+    tried = [(int(place), int(i)) for place, i in zip(*np.unravel_index(found, heights.shape), strict=True)]
     if len(rest) == 1:
         return tried[0]
     branches = []
@@ -125,7 +127,7 @@ def ahead(views, crops, rings: Rings, parts, members, poses, rest, places, heigh
 
 
 def registered(views, crops, rings: Rings, parts, render: Render, poses, members: list[int], rest: list[int], o: Growth, seed: int, links):
-    """Places (K, R, 4, 4) of `rest` against the model of `members` and their scores (K, R): what near-by viewpoints show and links say."""
+    """Places (K, R, 4, 4) of `rest` against the model of `members` and their scores (K, R): what all viewpoints show and links say."""
     far = float(np.median(np.linalg.norm(poses[members][:, :3, 3], axis=1)))
     directions = directions_around(o.viewpoints, seed)
     cameras = views_from(directions, far)
