@@ -121,3 +121,11 @@ def look_at(eye, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), roll: float = 0.0) 
     y = np.cross(z, x)
     c, s = np.cos(roll), np.sin(roll)
     return similarity(np.stack([c * x + s * y, c * y - s * x, z], axis=1), eye)
+
+
+def turns_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) degrees by which each object is turned from one set of poses (N, 4, 4) object_from_camera to the other, after the turn of the
+    whole that most objects agree on."""
+    turns = [x[:3, :3] @ y[:3, :3].T for x, y in zip(a, b, strict=True)]
+    angles = np.array([[rotation_angle(s.T @ t) for t in turns] for s in turns])
+    return angles[np.median(angles, 1).argmin()]

@@ -9,12 +9,11 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
-from relit.cameras.se3 import rotation_angle
+from relit.cameras.se3 import rotation_angle, turns_apart
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import named
 from relit.fit.instance_options import Search
-from relit.fit.instance_trials import apart
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
 from relit.fit.odd_instances import odd_instances, view_errors
@@ -134,7 +133,7 @@ def joint_stage(views: list[View], poses: np.ndarray, name: str, number: int, ru
             mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
             _, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
             poses[~odd] = moved if disagree else poses[~odd]
-        again = disagree and float(np.median(apart(before[~odd], poses[~odd]))) > ARRIVED
+        again = disagree and float(np.median(turns_apart(before[~odd], poses[~odd]))) > ARRIVED
         stage.save("joint", poses=poses, odd=odd, again=again)
     return poses, odd, again
 

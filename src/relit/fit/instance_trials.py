@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from relit.cameras.se3 import rotation_angle
+from relit.cameras.se3 import turns_apart
 from relit.fit.instance_options import Search
 from relit.fit.instance_rounds import model_of_all
 from relit.fit.instance_search import place
@@ -51,13 +51,5 @@ def place_few(views: list[View], o: Search, *, seed: int = 0, links=(), say=lamb
 
 
 def turned_apart(a: np.ndarray, b: np.ndarray) -> float:
-    """Degrees by which that object is turned which two sets of poses (N, 4, 4) object_from_camera put most differently (see `apart`)."""
-    return float(apart(a, b).max())
-
-
-def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) degrees by which each object is turned from one set of poses (N, 4, 4) object_from_camera to the other, after the turn of the
-    whole that most objects agree on."""
-    turns = [x[:3, :3] @ y[:3, :3].T for x, y in zip(a, b, strict=True)]
-    angles = np.array([[rotation_angle(s.T @ t) for t in turns] for s in turns])
-    return angles[np.median(angles, 1).argmin()]
+    """Degrees by which that object is turned which two sets of poses (N, 4, 4) object_from_camera put most differently."""
+    return float(turns_apart(a, b).max())
