@@ -24,9 +24,10 @@ def painted_over(mesh: Mesh, seen: np.ndarray, textures: dict[str, np.ndarray], 
         return textures
     names, sizes = list(textures), [t[0, 0].size for t in textures.values()]
     together = np.concatenate([t.reshape(*t.shape[:2], -1) for t in textures.values()], -1).astype(np.float64)
-    guessed = interpolate(continued(mesh, seen, together), mesh.faces, face, bary)
     known = face >= 0
     unseen = known & ~seen[np.maximum(face, 0)]
+    shown = fill_gutters(together, known & ~unseen)  # a corner of a seen face may lie on a texel of one that is not
+    guessed = interpolate(continued(mesh, seen, shown), mesh.faces, face, bary)
     out = fill_gutters(np.where(unseen[..., None], guessed, together).astype(np.float32), known)
     parts = np.split(out, np.cumsum(sizes)[:-1], -1)
     return {n: p.reshape(textures[n].shape).astype(textures[n].dtype) for n, p in zip(names, parts, strict=True)}
