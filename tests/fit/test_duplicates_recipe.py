@@ -179,6 +179,8 @@ def test_poses_wait_for_the_coarse_level_and_distances_move_on_the_middle_one(pi
 
         return fit(bank, model, o, stage, seed, begin)
 
+    with Run.open(tmp_path / "still", {}) as run, run.stage("volume", steps=18, title="volume") as stage:
+        assert np.allclose(shape.shape_and_poses(views, poses, run, stage, options, 0, still=True)[2], poses, atol=1e-6)
     monkeypatch.setattr(shape, "fit_volume", watched)
     with Run.open(tmp_path / "run", {}) as run, run.stage("volume", steps=18, title="volume") as stage:
         _, bank, _ = shape.shape_and_poses(views, poses, run, stage, options, 0)
@@ -228,23 +230,27 @@ def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
 
 
 def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
-    """Who is left out of one pass is not in the next; at most PASSES are made."""
+    """Who is left out of one pass is not in the next; at most PASSES are made. Poses that textures had to lead back are to stay then."""
     asked = []
 
     def stage(views, poses, name, number, run, options, seed):
         asked.append((name, list(views)))
         odd = np.array([v == "b" for v in views])
-        return poses + np.where(odd, 0, 1)[:, None, None], odd, number < arrives
+        return poses + np.where(odd, 0, 1)[:, None, None], odd, number < agree, 2.0 if number < arrives else 0.1
 
     monkeypatch.setattr(shape, "joint_stage", stage)
     start = np.zeros((3, 4, 4))
-    arrives = 2
-    poses, odd = shape.joint_stages(["a", "b", "c"], start, None, None, 0)
+    arrives, agree = 2, 99
+    poses, odd, arrived = shape.joint_stages(["a", "b", "c"], start, None, None, 0)
     assert [name for name, _ in asked] == ["joint", "joint_2", "joint_3"]
     assert [some for _, some in asked] == [["a", "b", "c"], ["a", "c"], ["a", "c"]]
     assert odd.tolist() == [False, True, False] and poses[:, 0, 0].tolist() == [3, 0, 3] and not start.any()
+    assert arrived
     asked.clear()
-    arrives = 99
+    arrives, agree = 99, 1
+    assert not shape.joint_stages(["a", "b", "c"], start, None, None, 0)[2] and len(asked) == 2, "labels and textures agree"
+    asked.clear()
+    agree = 99
     shape.joint_stages(["a", "b", "c"], start, None, None, 0)
     assert len(asked) == shape.PASSES
 

@@ -8,6 +8,7 @@ import trimesh
 
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import move_points
+from relit.fit import joint_alignment
 from relit.fit.joint_alignment import (
     EXACT,
     follow_views,
@@ -53,24 +54,29 @@ def camera_at(direction, turn) -> Camera:
     return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
 
 
-@pytest.fixture(scope="module")
-def seen():
-    """(mesh, cameras, pictures, masks): six views of one lump, within 60 degrees of their neighbours."""
-    mesh = lump()
+def shown(mesh: Mesh, cameras: list[Camera]):
+    """(pictures, masks) of the mesh, each under another light."""
     scene = build_geometry(mesh)
-    sides = [(1, 0, 0), (1, 0.5, 0.1), (0.8, 0.2, 0.6), (1, -0.5, 0.2), (0.9, 0.1, -0.5), (0.7, 0.6, 0.5)]
-    cameras = [camera_at(s, 0.9 * k) for k, s in enumerate(sides)]
     pictures, masks = [], []
     part = (np.arange(4) + 0.5) / 4
     y, x = np.mgrid[:SIZE, :SIZE]
     at = np.broadcast_arrays(x[..., None, None] + part, y[..., None, None] + part[:, None])
     for k, camera in enumerate(cameras):
-        shown = shown_by(mesh, scene, camera, np.ones((SIZE, SIZE), np.float32))
-        brightness = 0.6 + 0.3 * np.sin(0.02 * x + k)[..., None]  # light is another thing in each
-        pictures.append(np.where(shown.hit[..., None], brightness * colours(shown.point), 0.1).astype(np.float32))
+        seen = shown_by(mesh, scene, camera, np.ones((SIZE, SIZE), np.float32))
+        brightness = 0.6 + 0.3 * np.sin(0.02 * x + k)[..., None]
+        pictures.append(np.where(seen.hit[..., None], brightness * colours(seen.point), 0.1).astype(np.float32))
         hit = np.isfinite(trace(scene, camera, at[0].ravel(), at[1].ravel())[0])
         masks.append(hit.reshape(SIZE, SIZE, 16).mean(-1).astype(np.float32))
-    return mesh, cameras, pictures, masks
+    return pictures, masks
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """(mesh, cameras, pictures, masks): six views of one lump, within 60 degrees of their neighbours."""
+    mesh = lump()
+    sides = [(1, 0, 0), (1, 0.5, 0.1), (0.8, 0.2, 0.6), (1, -0.5, 0.2), (0.9, 0.1, -0.5), (0.7, 0.6, 0.5)]
+    cameras = [camera_at(s, 0.9 * k) for k, s in enumerate(sides)]
+    return mesh, cameras, *shown(mesh, cameras)
 
 
 def astray(cameras, degrees, seed=0) -> list[Camera]:
@@ -188,3 +194,21 @@ def test_without_texture_outlines_are_followed_alone(seen):
     _, poses, said = follow_views(mesh, cameras, plain, masks, everywhere(masks), 2)
     np.testing.assert_array_equal(poses, follow_with_poses(mesh, cameras, masks, everywhere(masks), 2)[1])
     assert said == ""
+
+
+def test_a_shape_that_is_wrong_bends_until_textures_agree(monkeypatch):
+    """Of views from all around, with poses that are off too: as stiff as it is at first the mesh does not follow."""
+    mesh = lump()
+    sides = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)] + [(0, 0, 1.0), (0, 0.1, -1), (1, 0, 0), (-1, 0, 0.1)])
+    cameras = [camera_at(s, 0.9 * k) for k, s in enumerate(sides)]
+    pictures, masks = shown(mesh, cameras)
+    v = mesh.vertices.astype(np.float64)
+    bulge = 1 + 0.25 * np.sin(6 * v[:, :1]) * np.cos(5 * v[:, 2:])
+    wrong = replace(mesh, vertices=(v * bulge).astype(np.float32))
+    placed = astray(cameras, 4.0)
+    ends = {}
+    for rounds in (0, 16):
+        monkeypatch.setattr(joint_alignment, "SOFT", rounds)
+        found, poses, _ = follow_views(wrong, placed, pictures, masks, everywhere(masks), 5)
+        ends[rounds] = apart(poses, cameras, mesh), misfit(texture_shifts(found, with_poses(cameras, poses), pictures, masks))
+    assert ends[0][1] > EXACT > 2 * ends[16][1] and ends[16][0] < 0.6 * ends[0][0]

@@ -103,25 +103,27 @@ def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: Dup
 
 
 def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool) after a first volume pass, and others while textures say that poses are still on their way (at most PASSES):
-    what each gives is thrown away but for the poses, and which instances show what does not agree with the model of all. A shape that grew
-    up with better poses is sharper, and moves them on."""
-    poses, odd = poses.copy(), np.zeros(len(views), bool)
+    """(poses, odd (N,) bool, arrived) after a first volume pass, and others while textures say that poses are still on their way (at most
+    PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with the model of all. A shape
+    that grew up with better poses is sharper, and moves them on. arrived: textures did not agree with the last one's poses, which a volume
+    pass would only lead away again."""
+    poses, odd, disagree = poses.copy(), np.zeros(len(views), bool), False
     for number in range(PASSES):
         rest = np.flatnonzero(~odd)
         name = "joint" if number == 0 else f"joint_{number + 1}"
-        poses[rest], odd[rest], again = joint_stage([views[k] for k in rest], poses[rest], name, number, run, options, seed)
-        if not again:
+        poses[rest], odd[rest], disagree, turn = joint_stage([views[k] for k in rest], poses[rest], name, number, run, options, seed)
+        if not disagree or turn < ARRIVED:
             break
-    return poses, odd
+    return poses, odd, disagree
 
 
 def joint_stage(views: list[View], poses: np.ndarray, name: str, number: int, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool, again) after one such pass. Textures are asked here already: what the pass has built in the wrong place it
-    does not take back. again: they did not agree with poses that follow the labels alone, and the pass has turned the instances."""
+    """(poses, odd (N,) bool, disagree, turn) after one such pass. Textures are asked here already: what the pass has built in the wrong
+    place it does not take back. disagree: they did not agree with poses that follow the labels alone. turn: degrees by which the pass has
+    turned the instances, the median."""
     if run.done(name):
         saved = run_arrays(run, name, "joint")
-        return saved["poses"], saved["odd"], bool(saved.get("again", False))
+        return saved["poses"], saved["odd"], bool(saved.get("disagree", False)), float(saved.get("turn", 0))
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
         before, disagree = poses, False
@@ -133,20 +135,21 @@ def joint_stage(views: list[View], poses: np.ndarray, name: str, number: int, ru
             mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
             _, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
             poses[~odd] = moved if disagree else poses[~odd]
-        again = disagree and float(np.median(turns_apart(before[~odd], poses[~odd]))) > ARRIVED
-        stage.save("joint", poses=poses, odd=odd, again=again)
-    return poses, odd, again
+        turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
+        stage.save("joint", poses=poses, odd=odd, disagree=disagree, turn=turn)
+    return poses, odd, disagree, turn
 
 
 def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):
     """(views, poses, model) after the volume pass, from the poses of the first ones. Instances that do not agree with their model are
     left out; they, and `others`, which the search could not place, are then sought in the finished model."""
+    arrived = False
     if pose_rate(views, options) > 0:
-        poses, odd = joint_stages(views, poses, run, options, seed)
+        poses, odd, arrived = joint_stages(views, poses, run, options, seed)
         others = [*others, *(views[k] for k in np.flatnonzero(odd))]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
-        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed)
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, still=arrived)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
             views, poses = with_found(views, poses, others, model, bank, run, seed)
         return views, poses, model
@@ -171,8 +174,8 @@ def pose_rate(views: list[View], options: DuplicatesOptions) -> float:
     return 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
 
 
-def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: DuplicatesOptions, seed: int):
-    """One volume pass: (model, its pixel bank, poses)."""
+def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: DuplicatesOptions, seed: int, still: bool = False):
+    """One volume pass: (model, its pixel bank, poses). still: the poses stay as they are."""
     bank = pixel_bank(views, poses)
     inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
     try:
@@ -188,7 +191,7 @@ def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: D
     scene = related(views, poses, run)
     model.appearance = shade_world if len(scene.motions) == 1 else partial(shade_world, turns=light_turns(views, scene))
     model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
-    rate = pose_rate(views, options)
+    rate = 0.0 if still else pose_rate(views, options)
     if rate > 0:
         move_poses(bank, model)
     # on a coarse grid the shape is wrong by more than the poses, which would follow it away from where they are

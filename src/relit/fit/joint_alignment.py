@@ -3,7 +3,8 @@
 `fit.outlines` believes the labels to a tenth of a pixel, and poses follow them. Labels that people or networks draw leave out wheels, cut
 corners and waver by a pixel or two; poses that follow those blur the texture, as each instance paints it in another place. So the textures
 are asked (`fit.texture_shifts`): where they lie more than a pixel off, the labels cannot be exact, and outlines and textures are solved
-for together, each weighted by what its samples scatter. Exact labels are left alone: they know more than optical flow does.
+for together, each weighted by what its samples scatter. Exact labels are left alone: they know more than optical flow does. Where textures
+do not come to lie on one another so, it is the shape that is wrong, often by the depth of a whole side, and it may bend further.
 
 One Gauss-Newton step for all poses and the displacements d of the vertices along their normals n. A place X that view j shows where view i
 shows it too moves in view i by
@@ -22,13 +23,28 @@ import numpy as np
 from scipy.sparse import bmat, coo_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
-from relit.fit.outlines import FARTHEST, REST, STIFF, after_motion, by_motion, follow_with_poses, laplacian, moved, outline_of, precision
+from relit.fit.outlines import (
+    FAR,
+    FARTHEST,
+    REST,
+    STIFF,
+    after_motion,
+    by_motion,
+    follow_with_poses,
+    laplacian,
+    moved,
+    outline_of,
+    precision,
+)
 from relit.fit.texture_shifts import Shifts, misfit, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
 EXACT = 1.0  # pixels by which textures may be off before labels are doubted
-TEXTURES, BOTH = 6, 8  # rounds: poses as textures have them, then poses and mesh as both have them
+TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, then of a softer mesh
+SHARP = 0.5  # pixels by which textures may be off before the shape is doubted
+YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
+LABELS = 0.7  # pixels; what has contradicted textures is told no better than this
 FAINTEST = 0.15  # pixels; flow is told no better than this
 OUTLIER = 3.0  # spreads; a shift of so much counts a quarter
 SLANTED = 4.0  # size of M up to which a place is told
@@ -59,15 +75,21 @@ def follow_views(mesh: Mesh, cameras: list[Camera], pictures, masks, known, roun
     before = misfit(texture_shifts(outlined, with_poses(cameras, poses), pictures, masks))
     if before <= EXACT:
         return outlined, poses, ""
-    found, placed = outlined, with_poses(cameras, poses)
-    for n in range(TEXTURES + BOTH):
+    found, placed, spread = outlined, with_poses(cameras, poses), 0.0
+    for n in range(TEXTURES + BOTH + SOFT):
         shifts = texture_shifts(found, placed, pictures, masks)
         if not shifts:
             return outlined, poses, ""
+        rows = texture_rows(shifts, placed)
         if n < TEXTURES:
-            _, placed = solved(found, placed, texture_rows(shifts, placed), still=True)
+            _, placed = solved(found, placed, rows, still=True)
+        elif n < TEXTURES + BOTH:
+            found, placed = solved(found, placed, rows + outline_rows(found, placed, masks, known)[0])
+        elif n == TEXTURES + BOTH and misfit(shifts) < SHARP:
+            break
         else:
-            found, placed = solved(found, placed, texture_rows(shifts, placed) + outline_rows(found, placed, masks, known))
+            others, spread = outline_rows(found, placed, masks, known, max(spread, LABELS))
+            found, placed = solved(found, placed, rows + others, stiffness=YIELDING)
     after = misfit(texture_shifts(found, placed, pictures, masks))
     if not 0 < after < before:
         return outlined, poses, ""
@@ -117,20 +139,29 @@ def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
     return out
 
 
-def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known) -> list[Rows]:
-    """One equation for each sample of the outlines, across them."""
+def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known, least: float = 0.0) -> tuple[list[Rows], float]:
+    """One equation for each sample of the outlines, across them; and their spread in pixels.
+
+    least: spread that is taken at least. Where it is given nearly all samples count, however far they are off: those that are farthest
+    off tell most of a wrong shape. Else they are outliers (`outlines.precision`).
+    """
     scene = build_geometry(mesh)
     found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
-    trust = np.split(precision(np.concatenate([o.shift for o in found])), np.cumsum([len(o.shift) for o in found])[:-1])
+    shift = np.concatenate([o.shift for o in found])
+    spread = max(1.48 * float(np.median(np.abs(shift - np.median(shift)))), least)
+    trust = 1 / (spread * (1 + (shift / max(FAR, OUTLIER * spread)) ** 2)) ** 2 if least else precision(shift)
+    trust = np.split(trust, np.cumsum([len(o.shift) for o in found])[:-1])
     out = []
     for i, (camera, o, weight) in enumerate(zip(cameras, found, trust, strict=True)):
         across = by_motion(camera, o, camera.camera_from_world[:3, 3])
         out.append(Rows([(np.full(len(weight), i), across)], o.corners, o.weights * o.scale[:, None], o.shift, weight))
-    return out
+    return out, spread
 
 
-def solved(mesh: Mesh, cameras: list[Camera], rows: list[Rows], still: bool = False) -> tuple[Mesh, list[Camera]]:
-    """Mesh and cameras after one weighted least-squares step. still: the mesh stays."""
+def solved(
+    mesh: Mesh, cameras: list[Camera], rows: list[Rows], still: bool = False, stiffness: tuple[float, float] = (STIFF, REST)
+) -> tuple[Mesh, list[Camera]]:
+    """Mesh and cameras after one weighted least-squares step. still: the mesh stays. stiffness: as `outlines.STIFF` and `outlines.REST`."""
     n, vertices = len(cameras), len(mesh.vertices)
     starts = np.cumsum([0, *(len(r.shift) for r in rows)])
     line, column, value = [], [], []
@@ -149,7 +180,8 @@ def solved(mesh: Mesh, cameras: list[Camera], rows: list[Rows], still: bool = Fa
     pixels = float(np.median([c.fx / np.linalg.norm(c.centre) for c in cameras]))  # of a unit length
     if not still:
         smooth = pixels * laplacian(mesh.faces, vertices)
-        damping = bmat([[damping, None], [None, STIFF * (smooth.T @ smooth) + REST * pixels**2 * identity(vertices)]])
+        stiff, rest = stiffness
+        damping = bmat([[damping, None], [None, stiff * (smooth.T @ smooth) + rest * pixels**2 * identity(vertices)]])
     step = splu((normal + damping).tocsc()).solve(a.T @ (trust * shift))
     placed = [turned(c, s) for c, s in zip(cameras, step[: 6 * n].reshape(n, 6), strict=True)]
     return (mesh if still else moved(mesh, np.clip(step[6 * n :], -FARTHEST / pixels, FARTHEST / pixels))), placed
