@@ -85,3 +85,18 @@ def test_part_that_hangs_on_nothing_seen_takes_the_mean(ball):
     values = continued(both, seen, texture)
     assert values[:n].min() > 0.399 and values[:n].max() < 0.601
     assert np.ptp(values[n:]) < 1e-3 and 0.4 < values[n, 0] < 0.6
+
+
+def test_specks_at_the_rim_are_not_carried_over_the_back(ball):
+    """A texel in twenty of the front is noise."""
+    from relit.fit.unseen import seen_faces
+    from relit.fit.unseen_paint import painted_over
+
+    mesh, cameras = ball
+    face, bary = rasterise_atlas(mesh, SIZE)
+    seen = seen_faces(mesh, cameras)
+    rng = np.random.default_rng(0)
+    paint = np.where(rng.uniform(size=(SIZE, SIZE, 1)) < 0.05, rng.uniform(size=(SIZE, SIZE, 3)), [0.8, 0.6, 0.1]).astype(np.float32)
+    back = (face >= 0) & ~seen[np.maximum(face, 0)]
+    off = np.abs(painted_over(mesh, seen, {"base_color": paint}, face, bary)["base_color"][back] - [0.8, 0.6, 0.1])
+    assert off.max() < 0.2

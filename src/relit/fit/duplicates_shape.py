@@ -43,12 +43,12 @@ def shape_stages(
     normal) or empty; for each instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view);
     motions (P, 4, 4) first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances
     (N,) which of the instances it is."""
-    views, poses, model = volume_stage(views, poses, others, run, options, seed)
+    views, poses, model, arrived = volume_stage(views, poses, others, run, options, seed)
     rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
-        if rate > 0:
+        if rate > 0 and not arrived:  # else outlines and textures have had their say before the last pass
             mesh, poses, _ = followed(mesh, views, poses, run, options)
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
@@ -141,8 +141,8 @@ def joint_stage(views: list[View], poses: np.ndarray, name: str, number: int, ru
 
 
 def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):
-    """(views, poses, model) after the volume pass, from the poses of the first ones. Instances that do not agree with their model are
-    left out; they, and `others`, which the search could not place, are then sought in the finished model."""
+    """(views, poses, model, arrived: see `joint_stages`) after the volume pass, from the poses of the first ones. Instances that do not
+    agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished model."""
     arrived = False
     if pose_rate(views, options) > 0:
         poses, odd, arrived = joint_stages(views, poses, run, options, seed)
@@ -152,7 +152,7 @@ def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, 
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, still=arrived)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
             views, poses = with_found(views, poses, others, model, bank, run, seed)
-        return views, poses, model
+        return views, poses, model, arrived
 
 
 def with_found(views: list[View], poses: np.ndarray, others: list[View], model: VolumeModel, bank: PixelBank, run, seed: int):

@@ -2,7 +2,7 @@
 
 `fit.outlines` believes the labels to a tenth of a pixel, and poses follow them. Labels that people or networks draw leave out wheels, cut
 corners and waver by a pixel or two; poses that follow those blur the texture, as each instance paints it in another place. So the textures
-are asked (`fit.texture_shifts`): where they lie more than a pixel off, the labels cannot be exact, and outlines and textures are solved
+are asked (`fit.texture_shifts`): where they lie clearly off, the labels cannot be exact, and outlines and textures are solved
 for together, each weighted by what its samples scatter. Exact labels are left alone: they know more than optical flow does. Where textures
 do not come to lie on one another so, it is the shape that is wrong, often by the depth of a whole side, and it may bend further.
 
@@ -40,7 +40,7 @@ from relit.fit.texture_shifts import Shifts, misfit, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
-EXACT = 1.0  # pixels by which textures may be off before labels are doubted
+EXACT = 0.7  # pixels by which textures may be off before labels are doubted
 TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, then of a softer mesh
 SHARP = 0.5  # pixels by which textures may be off before the shape is doubted
 YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
@@ -142,8 +142,8 @@ def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
 def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known, least: float = 0.0) -> tuple[list[Rows], float]:
     """One equation for each sample of the outlines, across them; and their spread in pixels.
 
-    least: spread that is taken at least. Where it is given nearly all samples count, however far they are off: those that are farthest
-    off tell most of a wrong shape. Else they are outliers (`outlines.precision`).
+    least: spread that is taken at least; where it is given nearly all samples count, however far they are off: those that are farthest off
+    tell most of a wrong shape. Without, they are outliers (`outlines.precision`).
     """
     scene = build_geometry(mesh)
     found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]

@@ -14,6 +14,7 @@ from relit.geometry.bake import fill_gutters, interpolate
 from relit.geometry.tangents import edges
 from relit.scene import Mesh
 
+RINGS = 20  # steps of diffusion among vertices that are seen: at the rim a texel is told by few grazing rays, and is often noise
 LEAK = 1e-6  # pull to the mean of what is seen: parts that hang on nothing seen take it
 
 
@@ -34,7 +35,8 @@ def painted_over(mesh: Mesh, seen: np.ndarray, textures: dict[str, np.ndarray], 
 
 
 def continued(mesh: Mesh, seen: np.ndarray, texture: np.ndarray) -> np.ndarray:
-    """(V, C) texture at the vertices: looked up where a seen face meets, harmonic elsewhere. seen: (F,) bool; texture: (S, S, C)."""
+    """(V, C) texture at the vertices: looked up where a seen face meets, and smoothed there; harmonic elsewhere. seen: (F,)
+    bool; texture: (S, S, C)."""
     _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)  # seams double vertices
     place, size = place.ravel(), texture.shape[0]
     count = int(place.max()) + 1
@@ -49,8 +51,17 @@ def continued(mesh: Mesh, seen: np.ndarray, texture: np.ndarray) -> np.ndarray:
         sides = np.concatenate([sides, sides[:, ::-1]])
         near = coo_matrix((np.ones(len(sides)), (sides[:, 0], sides[:, 1])), (count, count)).tocsr()
         near.data[:] = 1
+        values[~free] = diffused(values[~free], near[~free][:, ~free])
         laplacian = (diags(np.asarray(near.sum(1)).ravel()) - near + LEAK * identity(count)).tocsr()
         mean = values[~free].mean(0)
         right = LEAK * mean - laplacian[free][:, ~free] @ values[~free]
         values[free] = splu(laplacian[free][:, free].tocsc()).solve(right)
     return values[place]
+
+
+def diffused(values: np.ndarray, near) -> np.ndarray:
+    """Values (V, C) after RINGS steps towards the mean of the neighbours. near: (V, V), 1 for neighbours, sparse."""
+    degree = np.asarray(near.sum(1)).reshape(-1, 1)
+    for _ in range(RINGS):
+        values = 0.5 * (values + np.where(degree > 0, near @ values / np.maximum(degree, 1), values))
+    return values
