@@ -105,16 +105,17 @@ def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: Dup
 def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
     """(poses, odd (N,) bool, arrived) after a first volume pass, and others while textures say that poses are still on their way (at most
     PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with the model of all. A shape
-    that grew up with better poses is sharper, and moves them on. arrived: textures did not agree with the last one's poses, which a volume
-    pass would only lead away again."""
-    poses, odd, disagree = poses.copy(), np.zeros(len(views), bool), False
+    that grew up with better poses is sharper, and moves them on. arrived: textures brought the poses back to where they had been before the
+    last pass, and another one would only lead them away again."""
+    poses, odd, arrived = poses.copy(), np.zeros(len(views), bool), False
     for number in range(PASSES):
         rest = np.flatnonzero(~odd)
         name = "joint" if number == 0 else f"joint_{number + 1}"
         poses[rest], odd[rest], disagree, turn = joint_stage([views[k] for k in rest], poses[rest], name, number, run, options, seed)
-        if not disagree or turn < ARRIVED:
+        arrived = disagree and turn < ARRIVED
+        if arrived or not disagree:
             break
-    return poses, odd, disagree
+    return poses, odd, arrived
 
 
 def joint_stage(views: list[View], poses: np.ndarray, name: str, number: int, run, options: DuplicatesOptions, seed: int):

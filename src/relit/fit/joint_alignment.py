@@ -2,9 +2,9 @@
 
 `fit.outlines` believes the labels to a tenth of a pixel, and poses follow them. Labels that people or networks draw leave out wheels, cut
 corners and waver by a pixel or two; poses that follow those blur the texture, as each instance paints it in another place. So the textures
-are asked (`fit.texture_shifts`): where they lie clearly off, the labels cannot be exact, and outlines and textures are solved
-for together, each weighted by what its samples scatter. Exact labels are left alone: they know more than optical flow does. Where textures
-do not come to lie on one another so, it is the shape that is wrong, often by the depth of a whole side, and it may bend further.
+are asked (`fit.texture_shifts`): where they lie clearly off, labels or shape are wrong, and outlines and textures are solved for together,
+each weighted by what its samples scatter. Labels that agree are left alone: they know more than optical flow does. Where textures do not
+come to lie on one another so, it is the shape that is wrong, often by the depth of a whole side, and it may bend further.
 
 One Gauss-Newton step for all poses and the displacements d of the vertices along their normals n. A place X that view j shows where view i
 shows it too moves in view i by
@@ -35,12 +35,13 @@ from relit.fit.outlines import (
     moved,
     outline_of,
     precision,
+    spread_of,
 )
 from relit.fit.texture_shifts import Shifts, misfit, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
-EXACT = 0.7  # pixels by which textures may be off before labels are doubted
+EXACT = 0.7  # pixels by which textures may be off before they have a part in it
 TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, then of a softer mesh
 SHARP = 0.5  # pixels by which textures may be off before the shape is doubted
 YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
@@ -148,8 +149,8 @@ def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known, least: float =
     scene = build_geometry(mesh)
     found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
     shift = np.concatenate([o.shift for o in found])
-    spread = max(1.48 * float(np.median(np.abs(shift - np.median(shift)))), least)
-    trust = 1 / (spread * (1 + (shift / max(FAR, OUTLIER * spread)) ** 2)) ** 2 if least else precision(shift)
+    spread = max(spread_of(shift), least)
+    trust = precision(shift, spread, max(FAR, OUTLIER * spread) if least else FAR)
     trust = np.split(trust, np.cumsum([len(o.shift) for o in found])[:-1])
     out = []
     for i, (camera, o, weight) in enumerate(zip(cameras, found, trust, strict=True)):

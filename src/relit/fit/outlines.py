@@ -100,10 +100,15 @@ def after_motion(camera: Camera, step: np.ndarray, middle: np.ndarray) -> np.nda
     return np.asarray(camera.world_from_camera, np.float64) @ np.linalg.inv(motion)
 
 
-def precision(shift: np.ndarray) -> np.ndarray:
-    """The weight of each sample, by its own size and by the robust spread of all (in pixels)."""
-    spread = max(1.48 * float(np.median(np.abs(shift - np.median(shift)))), SURE)
-    return 1 / (spread * (1 + (shift / FAR) ** 2)) ** 2
+def spread_of(shift: np.ndarray) -> float:
+    """The robust spread of samples (N,), as a standard deviation."""
+    return 1.48 * float(np.median(np.abs(shift - np.median(shift))))
+
+
+def precision(shift: np.ndarray, spread: float | None = None, far: float = FAR) -> np.ndarray:
+    """The weight of each sample, by its own size against `far` and by the spread of all, their own where none is given (in pixels)."""
+    spread = max(spread_of(shift) if spread is None else spread, SURE)
+    return 1 / (spread * (1 + (shift / far) ** 2)) ** 2
 
 
 def moved(mesh: Mesh, distance: np.ndarray) -> Mesh:
