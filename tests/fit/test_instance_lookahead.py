@@ -8,7 +8,7 @@ import pytest
 from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
 from relit.fit import instance_growth, instance_lookahead
-from relit.fit.instance_growth import ahead
+from relit.fit.instance_growth import ahead, standing
 from relit.fit.instance_lookahead import branch_values, mean_of_known
 from relit.fit.instance_options import Growth
 from relit.geometry.hull import NoShape
@@ -22,7 +22,9 @@ def test_branches_are_compared_over_those_whom_they_leave_out(monkeypatch):
     """Instance 3 agrees little with anything: a branch that it is a member of must not gain by that."""
     told = {(0, 1): {2: 0.7, 3: 0.3}, (0, 2): {1: 0.8, 3: 0.4}, (0, 3): {1: 0.7, 2: 0.65}}
     monkeypatch.setattr(
-        instance_lookahead, "heights_of", lambda v, c, r, p, members, poses, rest, o, seed: [told[tuple(members)][k] for k in rest]
+        instance_lookahead,
+        "heights_of",
+        lambda v, c, r, p, members, poses, rest, o, seed, flipped, plane: [told[tuple(members)][k] for k in rest],
     )
     branches = [([0, k], np.tile(np.eye(4), (4, 1, 1))) for k in (1, 2, 3)]
     value = branch_values([None] * 4, None, None, None, branches, Growth(), 0)
@@ -31,7 +33,7 @@ def test_branches_are_compared_over_those_whom_they_leave_out(monkeypatch):
 
 
 def test_a_branch_without_a_common_shape_is_never_taken(monkeypatch):
-    def heights(v, c, r, p, members, poses, rest, o, seed):
+    def heights(v, c, r, p, members, poses, rest, o, seed, flipped, plane):
         if members == [0, 1]:
             raise NoShape("nothing in common")
         return np.full(len(rest), 0.2)
@@ -47,25 +49,32 @@ def test_means_of_what_is_known():
     assert mean_of_known(a, 0)[0] == 2 and np.isnan(mean_of_known(a, 0)[1])
 
 
-def test_who_joins_is_decided_by_what_becomes_of_the_others(monkeypatch):
-    places = np.array([[pose(0), pose(10)], [pose(90), pose(120)]])  # (K, R, 4, 4)
-    heights = np.array([[0.9, 0.8], [0.7, -1.0]])
-    seen = []
+def test_who_joins_is_decided_by_what_becomes_of_the_others_and_by_its_lead(monkeypatch):
+    places = np.array([[pose(0), pose(10)], [pose(90), pose(120)], [np.eye(4)] * 2])  # (K, R, 4, 4)
+    heights = np.array([[0.9, 0.8], [0.78, 0.76], [-1.0, -1.0]])
+    told, seen = np.array([0.0, 0.0, 0.2, 0.0]), []
 
-    def values(views, crops, rings, parts, branches, o, seed):
+    def values(views, crops, rings, parts, branches, o, seed, flipped, plane):
         seen.extend(branches)
-        return np.array([0.0, 0.01, 0.2][: len(branches)])
+        return told[: len(branches)]
 
     monkeypatch.setattr(instance_growth, "branch_values", values)
     poses, rest = np.tile(np.eye(4), (3, 1, 1)), [1, 2]
     rings = (None, None, None, None)
+    assert standing(places[:, 0], heights[:, 0], 0) == pytest.approx(0.12) and standing(places[:, 0], heights[:, 0], 1) == pytest.approx(
+        -0.12
+    )
+    told[2] = 0.3
     assert ahead(*rings, [0], poses, rest, places, heights, Growth(), 0, None) == (1, 0)  # third by its score, best for the others
-    assert [members for members, _ in seen] == [[0, 1], [0, 2], [0, 1]]  # what was not found (-1) is not tried
+    assert [members for members, _ in seen] == [[0, 1], [0, 2], [0, 1], [0, 2]]  # what was not found (-1) is not tried
     assert np.array_equal(seen[2][1][1], pose(90)) and np.array_equal(seen[2][1][2], np.eye(4))
+    told[2] = 0.2  # what it is ahead by in the others' eyes is less than what it lags behind the best place of its own
+    assert ahead(*rings, [0], poses, rest, places, heights, Growth(), 0, None) == (0, 0)
+    told[:2] = 0.0, 0.1
     assert ahead(*rings, [0], poses, rest, places, heights, Growth(ahead=2), 0, None) == (0, 1)
-    drawn = {ahead(*rings, [0], poses, rest, places, heights, Growth(leap=0.1), 0, np.random.default_rng(s)) for s in range(40)}
-    assert len(drawn) == 3
+    drawn = {ahead(*rings, [0], poses, rest, places, heights, Growth(leap=0.2), 0, np.random.default_rng(s)) for s in range(60)}
+    assert len(drawn) == 4
     nowhere = np.full((2, 1), -1.0)  # a search that finds nothing gives its first place
-    assert ahead(*rings, [0, 2], poses, [1], places[:, :1], nowhere, Growth(), 0, None) == (0, 0)
+    assert ahead(*rings, [0, 2], poses, [1], places[:2, :1], nowhere, Growth(), 0, None) == (0, 0)
     count = len(seen)
     assert ahead(*rings, [0, 2], poses, [1], places[:, :1], heights[:, :1], Growth(), 0, None) == (0, 0) and len(seen) == count

@@ -267,9 +267,9 @@ def test_growth_begins_with_the_best_guess_and_the_best_link(monkeypatch):
     scores[0, 1], scores[0, 2], scores[1, 3] = [0.9, 0.5], [0.9, 0.6], [0.9, 0.7]
     guesses = Guesses(np.tile(np.eye(4), (2, 4, 2, 1, 1)), scores)
     values = {(0, 1): 0.1, (0, 2): 0.3, (1, 3): 0.2, (2, 3): -0.1}
-    told = lambda v, c, r, p, branches, o, seed: np.array([values[tuple(members)] for members, _ in branches])  # noqa: E731
+    told = lambda v, c, r, p, branches, o, seed, flipped: np.array([values[tuple(members)] for members, _ in branches])  # noqa: E731
     monkeypatch.setattr(instance_search, "branch_values", told)
-    begun = lambda links: [m for m, _ in first_starts(views, None, None, None, guesses, [0, 1], links, Search(pairs=3), 0)]  # noqa: E731
+    begun = lambda links: [m for m, _ in first_starts(views, None, None, DETAILED, guesses, [0, 1], links, Search(pairs=3), 0)]  # noqa: E731
     assert begun(()) == [[0, 2], [1, 3], [0, 1]]
     assert begun([(2, 3, np.eye(3))]) == [[0, 2], [2, 3], [1, 3], [0, 1]]
     values[2, 3] = 0.9

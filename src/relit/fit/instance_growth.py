@@ -14,12 +14,16 @@ import numpy as np
 
 from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
-from relit.fit.instance_lookahead import branch_values
+from relit.fit.instance_bodies import Body, body_of
+from relit.fit.instance_lookahead import branch_values, eyes_at
 from relit.fit.instance_options import Growth
-from relit.fit.instances import View, albedo_render, carved, first_pose, fit_model
-from relit.fit.register import Crop, Gallery, Render, Rings, chosen_rings, directions_around, refine, rings_of, search, views_from
+from relit.fit.instances import View, first_pose
+from relit.fit.mirror_plane import flipped_views
+from relit.fit.register import Crop, Rings, chosen_rings, directions_around, refine, search, views_from
 
 ANOTHER = 25.0  # degrees from which on a pose is another one
+TRUST = 1.0  # of what becomes of the others, in the lead of the one that joins
+FEW = 4  # members up to which, as long as no plane of symmetry is known, leads are less believed
 AT_ONCE = 12  # members for each further one that may join unsure of its place at the same time: one does not spoil a model of many
 
 
@@ -59,16 +63,19 @@ def grow(
     where none is sure; without it the best score does. Raises NoShape where the silhouettes of the members have nothing in common.
     """
     poses, scores = np.array(poses, np.float64), np.full(len(views), -1.0)
+    flipped = flipped_views(views, parts)
     members, expelled, turn = list(members), Counter(), 0
     firm, unsure = list(members), []
+    body: Body | None = None
     while True:
         turn += 1
-        some = [views[k] for k in members]
-        values = carved(some, poses[members], o.nodes, o.tolerance, o.depth, crossed=len(members) > 3)
-        model, poses[members] = fit_model(some, poses[members], values, o.steps, refine_cameras=o.rate, rays=o.rays, seed=seed)
-        render = albedo_render(model)
+        some, cameras = [views[k] for k in members], views_from(directions_around(o.viewpoints, seed + turn), eyes_at(poses[members]))
+        body = body_of(
+            some, poses[members], cameras, parts, o, steps=o.steps, seed=seed, pictures=flipped.of(members), plane=body and body.plane
+        )
+        own = chosen_rings(rings, members)
         poses[members], scores[members] = refine(
-            [crops[k] for k in members], poses[members], render, rings=chosen_rings(rings, members), steps=(0, 4.0, 2.0), parts=parts
+            [crops[k] for k in members], body.poses, body.render, rings=own, steps=(0, 4.0, 2.0), parts=parts
         )
         if len(members) > 2:
             level = np.median(scores[members]) - o.astray
@@ -78,14 +85,17 @@ def grow(
         rest = [k for k in range(len(views)) if k not in members]
         if not rest:
             return Grown(poses, scores, tuple(dict.fromkeys(k for k in firm if k in members)), tuple(unsure))  # some left and came back
-        places, heights = registered(views, crops, rings, parts, render, poses, members, rest, o, seed + turn, links)
+        places, heights = registered(views, crops, rings, parts, body, poses, members, rest, o, links)
         best = heights.argmax(0)
         margins = lead(places, heights)
         order = sorted(range(len(rest)), key=lambda i: -margins[i])
-        join = [i for i in order if margins[i] >= o.sure][: max(1, len(members) // 2)]
+        few = body.plane is None and len(members) < FEW
+        join = [i for i in order if margins[i] >= (o.sure_of_few if few else o.sure)][: max(1, len(members) // 2)]
         leap = not join
         if leap:
-            place, first = ahead(views, crops, rings, parts, members, poses, rest, places, heights, o, seed + turn, rng)
+            place, first = ahead(
+                views, crops, rings, parts, members, poses, rest, places, heights, o, seed + turn, rng, flipped, body.plane
+            )
             best[first] = place
             others = [i for i in np.argsort(-heights.max(0)).tolist() if i != first]
             join = [first, *others[: len(members) // AT_ONCE]]
@@ -97,19 +107,23 @@ def grow(
             members.append(k)
 
 
+def standing(places: np.ndarray, heights: np.ndarray, chosen: int) -> float:
+    """By how much one of the places (K, 4, 4) of an instance scores better than the best that is ANOTHER degrees away from it or more."""
+    away = [rotation_angle(places[chosen, :3, :3].T @ p[:3, :3]) >= ANOTHER for p in places]
+    return float(heights[chosen] - max([*heights[away], 0.0]))
+
+
 def lead(places: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """(R,) by how much the best of the places (K, R, 4, 4) of each scores better than the best one that is ANOTHER degrees away from it or
     more; heights: (K, R) their scores."""
-    out = np.empty(heights.shape[1])
-    for i, best in enumerate(heights.argmax(0)):
-        away = [rotation_angle(places[best, i, :3, :3].T @ p[:3, :3]) >= ANOTHER for p in places[:, i]]
-        out[i] = heights[best, i] - max(heights[away, i], default=0.0)
-    return out
+    return np.array([standing(places[:, i], heights[:, i], best) for i, best in enumerate(heights.argmax(0))])
 
 
-def ahead(views, crops, rings: Rings, parts, members, poses, rest, places, heights, o: Growth, seed: int, rng) -> tuple[int, int]:
-    """(place, instance of `rest`) after which all others agree best, of the `o.ahead` whose scores are best (see `branch_values`); an rng
-    draws, the likelier the better."""
+def ahead(
+    views, crops, rings: Rings, parts, members, poses, rest, places, heights, o: Growth, seed: int, rng, flipped=None, plane=None
+) -> tuple[int, int]:
+    """(place, instance of `rest`) after which all others agree best (see `branch_values`), with what it leads by itself, of the `o.ahead`
+    whose scores are best; an rng draws, the likelier the better."""
     order = np.argsort(-heights, axis=None)[: o.ahead]
     found = [at for at in order if heights.flat[at] > -1] or order[:1]
     tried = [(int(place), int(i)) for place, i in zip(*np.unravel_index(found, heights.shape), strict=True)]
@@ -120,26 +134,23 @@ def ahead(views, crops, rings: Rings, parts, members, poses, rest, places, heigh
         joined = poses.copy()
         joined[rest[i]] = places[place, i]
         branches.append(([*members, rest[i]], joined))
-    value = branch_values(views, crops, rings, parts, branches, o, seed)
+    value = branch_values(views, crops, rings, parts, branches, o, seed, flipped, plane)
+    value = value + TRUST * np.array([standing(places[:, i], heights[:, i], place) for place, i in tried])
     if rng is not None:
         value = value + o.leap * rng.gumbel(size=len(value))
     return tried[int(value.argmax())]
 
 
-def registered(views, crops, rings: Rings, parts, render: Render, poses, members: list[int], rest: list[int], o: Growth, seed: int, links):
+def registered(views, crops, rings: Rings, parts, body: Body, poses, members: list[int], rest: list[int], o: Growth, links):
     """Places (K, R, 4, 4) of `rest` against the model of `members` and their scores (K, R): what all viewpoints show and links say."""
-    far = float(np.median(np.linalg.norm(poses[members][:, :3, 3], axis=1)))
-    directions = directions_around(o.viewpoints, seed)
-    cameras = views_from(directions, far)
-    rgb, alpha = render(cameras)
     theirs, some = chosen_rings(rings, rest), [crops[k] for k in rest]
     # not look_for: what is hidden in part would fit early, and wrongly
-    found = search(some, Gallery(cameras, rings_of(rgb, alpha, parts=parts)), keep=o.keep, rings=theirs, apart=ANOTHER)
+    found = search(some, body.gallery, keep=o.keep, rings=theirs, apart=ANOTHER)
     tries = [found.poses[:, j] for j in range(o.keep)]
-    told = linked_poses(views, poses, members, rest, links, far)
+    told = linked_poses(views, poses, members, rest, links, eyes_at(poses[members]))
     if told:
         tries.append(np.array([told.get(k, tries[0][i]) for i, k in enumerate(rest)]))
-    refined = [refine(some, start, render, rings=theirs, steps=(0, 5.0, 2.5), parts=parts) for start in tries]
+    refined = [refine(some, start, body.render, rings=theirs, steps=(0, 5.0, 2.5), parts=parts) for start in tries]
     return np.array([poses for poses, _ in refined]), np.array([height for _, height in refined])
 
 

@@ -9,23 +9,38 @@ from __future__ import annotations
 
 import numpy as np
 
+from relit.fit.instance_bodies import body_of
 from relit.fit.instance_options import Growth
-from relit.fit.instances import View, albedo_render, carved, fit_model
-from relit.fit.register import Crop, Gallery, Rings, chosen_rings, directions_around, refine, rings_of, search, views_from
+from relit.fit.instances import View
+from relit.fit.mirror_plane import Flipped, Plane
+from relit.fit.register import Crop, Rings, chosen_rings, directions_around, refine, search, views_from
 from relit.geometry.hull import NoShape
 
 Branch = tuple[list[int], np.ndarray]  # members, and poses (N, 4, 4) of which theirs count
 
 
-def branch_values(views: list[View], crops: list[Crop], rings: Rings, parts, branches: list[Branch], o: Growth, seed: int) -> np.ndarray:
+def branch_values(
+    views: list[View],
+    crops: list[Crop],
+    rings: Rings,
+    parts,
+    branches: list[Branch],
+    o: Growth,
+    seed: int,
+    flipped: Flipped | None = None,
+    plane: Plane | None = None,
+) -> np.ndarray:
     """(B,) by how much better those who are no members are registered against a model of each branch than on the mean of the branches that
-    leave them out, their mean; -inf where the silhouettes of the members have nothing in common, 0 where nobody is left."""
+    leave them out, their mean; -inf where the silhouettes of the members have nothing in common, 0 where nobody is left.
+
+    plane: in which the object is its own mirror image; where none is known each branch seeks one, if all views are there flipped.
+    """
     table = np.full((len(branches), len(views)), np.nan)
     fits = np.ones(len(branches), bool)
     for b, (members, poses) in enumerate(branches):
         rest = [k for k in range(len(views)) if k not in members]
         try:
-            table[b, rest] = heights_of(views, crops, rings, parts, members, poses, rest, o, seed) if rest else np.nan
+            table[b, rest] = heights_of(views, crops, rings, parts, members, poses, rest, o, seed, flipped, plane) if rest else np.nan
         except NoShape:
             fits[b] = False
     gain = table - mean_of_known(table, 0)
@@ -40,15 +55,27 @@ def mean_of_known(a: np.ndarray, axis: int) -> np.ndarray:
 
 
 def heights_of(
-    views, crops, rings: Rings, parts, members: list[int], poses: np.ndarray, rest: list[int], o: Growth, seed: int
+    views,
+    crops,
+    rings: Rings,
+    parts,
+    members: list[int],
+    poses: np.ndarray,
+    rest: list[int],
+    o: Growth,
+    seed: int,
+    flipped=None,
+    plane=None,
 ) -> np.ndarray:
-    """(R,) scores of the best places of `rest` against a quick model of the members."""
-    some = [views[k] for k in members]
-    values = carved(some, poses[members], o.nodes, o.tolerance, o.depth, crossed=len(members) > 3)
-    model, _ = fit_model(some, poses[members], values, o.ahead_steps, refine_cameras=o.rate, rays=o.rays, seed=seed)
-    render = albedo_render(model)
-    far = float(np.median(np.linalg.norm(poses[members][:, :3, 3], axis=1)))
-    cameras = views_from(directions_around(o.ahead_views, seed), far)
-    theirs, others = chosen_rings(rings, rest), [crops[k] for k in rest]
-    found = search(others, Gallery(cameras, rings_of(*render(cameras), parts=parts)), keep=1, rings=theirs)
-    return refine(others, found.poses[:, 0], render, rings=theirs, steps=(0, 4.0, 2.0), parts=parts)[1]
+    """(R,) scores of the best places of `rest` against a quick model of the members. flipped, plane: as `branch_values`."""
+    some, theirs, others = [views[k] for k in members], chosen_rings(rings, rest), [crops[k] for k in rest]
+    cameras = views_from(directions_around(o.ahead_views, seed), eyes_at(poses[members]))
+    pictures = flipped.of(members) if flipped is not None and plane is None else None
+    body = body_of(some, poses[members], cameras, parts, o, steps=o.ahead_steps, seed=seed, pictures=pictures, plane=plane)
+    found = search(others, body.gallery, keep=1, rings=theirs)
+    return refine(others, found.poses[:, 0], body.render, rings=theirs, steps=(0, 4.0, 2.0), parts=parts)[1]
+
+
+def eyes_at(poses: np.ndarray) -> float:
+    """Median distance of cameras at `poses` (N, 4, 4) from the object's middle."""
+    return float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))

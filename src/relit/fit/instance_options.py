@@ -15,8 +15,9 @@ class Growth:
     nodes, steps, rate, depth: of the coarse models, as `Search`. tolerance: see `carved`; a body that is too fat agrees with wrong places
     as well, and with more of them at every turn. rays: of a step of a fit. viewpoints: all around. keep: places of each that are refined.
     sure: an instance whose best place scores by so much better than any other is nearly always right; while there are such, they join
-    first. ahead, ahead_steps, ahead_views: where there are none, so many ways to join are tried, each with a fit of so many steps and so
-    many views of it (fit/instance_lookahead.py). leap: spread of their values within which a draw decides, when instances are grown again.
+    first. sure_of_few: the same, of two or three that stand and do not tell the plane of symmetry (fit/mirror_plane.py). ahead,
+    ahead_steps, ahead_views: where there are none, so many ways to join are tried, each with a fit of so many steps and so many views of it
+    (fit/instance_lookahead.py). leap: spread of their values within which a draw decides, when instances are grown again.
     astray: a member whose score lies so much below the median is taken out again.
     """
 
@@ -33,6 +34,7 @@ class Growth:
     ahead_steps: int = 40
     ahead_views: int = 300
     sure: float = 0.06
+    sure_of_few: float = 0.1
     leap: float = 0.01
 
 

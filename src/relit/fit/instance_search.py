@@ -20,6 +20,7 @@ from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged
 from relit.fit.instance_rounds import crops_of, settled
 from relit.fit.instances import View, first_pose, frame_scale
+from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
 
@@ -46,7 +47,7 @@ def first_starts(views, crops, rings: Rings, parts, guesses: Guesses, chosen: li
         poses[pair] = guesses.poses[s, pair, 0]
         guessed.append((pair, poses))
     told = linked_sets(views, links, distance)[: o.pairs]
-    value = branch_values(views, crops, rings, parts, [*guessed, *told], o.growth, seed)
+    value = branch_values(views, crops, rings, parts, [*guessed, *told], o.growth, seed, flipped_views(views, parts))
     order = np.argsort(-value, kind="stable").tolist()
     kinds = [b >= len(guessed) for b in order]
     if len(set(kinds)) == 2:

@@ -1,0 +1,136 @@
+"""The plane in which an object is its own mirror image, told by a few of its views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relit.cameras.se3 import exp_so3
+from relit.conventions import similarity
+from relit.fit.instance_bodies import body_of
+from relit.fit.instance_options import Growth
+from relit.fit.instance_rounds import crops_of
+from relit.fit.instances import View
+from relit.fit.mirror_plane import FLIP, Hull, Plane, flip, flipped_views, normal_between, plane_scores
+from relit.fit.register import directions_around, views_from
+from relit.scene import Camera
+
+PARTS = (0.6, 2.0, 0.1)
+SIDE = 96
+
+
+def views_of_body(angles, colour, lopsided=0.0):
+    """(views, poses) of two ellipsoids, one at the other's head, coloured by position, seen from `angles` (degrees about +y) and a little
+    from above. lopsided: how far the head lies to one side (x)."""
+    u, v = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
+    camera = Camera(SIDE, SIDE, 230.0, 230.0, SIDE / 2, SIDE / 2, np.eye(4))
+    d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    parts = [(np.zeros(3), np.array([0.3, 0.25, 0.55])), (np.array([lopsided, 0.3, 0.35]), np.array([0.2, 0.3, 0.15]))]
+    views, poses = [], []
+    for k, a in enumerate(angles):
+        turn = exp_so3(np.array([0.0, np.radians(a), 0.0])) @ exp_so3(np.array([-0.4, 0.0, 0.0]))
+        pose = similarity(turn, -5.0 * turn[:, 2])
+        best, rgb = np.full(u.shape, np.inf), np.zeros((SIDE, SIDE, 3))
+        for centre, axes in parts:
+            o, w = (pose[:3, 3] - centre) / axes, (d @ turn.T) / axes
+            b, e, c = (w * o).sum(-1), (w * w).sum(-1), o @ o - 1
+            root = b * b - e * c
+            t = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / e, np.inf)
+            hit = t < best
+            p = pose[:3, 3] + np.where(hit, t, 0)[..., None] * (d @ turn.T)
+            rgb[hit], best = colour(p[hit]), np.minimum(best, t)
+        mask = np.isfinite(best).astype(np.float32)
+        views.append(View(k + 1, camera, rgb.astype(np.float32), mask, np.ones_like(mask), 1.0))
+        poses.append(pose)
+    return views, np.array(poses)
+
+
+def even(p):
+    """A colour that is the same on both sides of x = 0."""
+    return 0.2 + 0.6 * np.stack([p[:, 2] > 0.1, np.abs(p[:, 0]) > 0.15, p[:, 1] > 0.1], -1)
+
+
+def odd(p):
+    return 0.2 + 0.6 * np.stack([p[:, 0] > 0.02, p[:, 0] > 0.02, p[:, 1] > 0.1], -1)
+
+
+def test_a_flipped_picture_shows_the_mirrored_object():
+    view, pose = (a[0] for a in views_of_body([35], even))
+    view = replace(view, camera=replace(view.camera, cx=41.5))
+    plane = Plane(np.array([0.6, 0.0, 0.8]), 0.07)
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3))
+    mirrored = points @ plane.mirror[:3, :3].T + plane.mirror[:3, 3]
+    assert np.allclose(mirrored @ plane.normal + points @ plane.normal, 2 * plane.offset)
+    there = flip(view).camera.with_pose(plane.flipped(pose[None])[0])
+    assert np.isclose(np.linalg.det(there.world_from_camera[:3, :3]), 1)
+    a, b = view.camera.with_pose(pose).project(points), there.project(mirrored)
+    assert np.allclose(a[:, 0] + b[:, 0], SIDE) and np.allclose(a[:, 1:], b[:, 1:])
+    assert np.array_equal(flip(view).rgb, view.rgb[:, ::-1])
+
+
+def test_silhouettes_tell_where_the_plane_lies():
+    views, poses = views_of_body([-60, 10, 70, 150], even)
+    for offset in (0.0, 0.08):
+        moved = poses.copy()
+        moved[:, 0, 3] += offset
+        share, found = Hull(views, moved).offset(np.array([1.0, 0.0, 0.0]))
+        assert share > 0.98 and found == pytest.approx(offset, abs=0.03)
+    wrong = [Hull(views, poses).offset(np.array(n))[0] for n in ([0.0, 0.6, 0.8], [0.0, 0.0, 1.0], [0.6, 0.0, 0.8])]
+    assert max(wrong) < share - 0.01
+
+
+def test_the_normal_is_that_of_the_pictures_that_agree():
+    _, poses = views_of_body([-60, 10, 70, 150], even)
+    normal = np.array([0.8, 0.0, -0.6])
+    placed = Plane(normal, 0.0).flipped(poses)
+    placed[3] = similarity(exp_so3(np.array([0.0, 1.5, 0.3])), np.zeros(3)) @ placed[3]  # one slid away
+    start = exp_so3(np.array([0.0, 0.1, 0.0])) @ normal
+    assert abs(normal_between(poses, placed, start) @ normal) > 1 - 1e-9
+    assert np.array_equal(normal_between(poses[3:], placed[3:], start), start)
+    assert np.allclose(FLIP @ FLIP, np.eye(4))
+
+
+def found_plane(views, poses, seed=0):
+    o = Growth(nodes=28, steps=40, viewpoints=400)
+    cameras = views_from(directions_around(o.viewpoints, seed), 5.0)
+    return body_of(views, poses, cameras, PARTS, o, steps=o.steps, seed=seed, pictures=flipped_views(views, PARTS)).plane
+
+
+def test_a_few_views_tell_the_plane_and_where_there_is_none_none_is_found():
+    views, poses = views_of_body([-100, -30, 40, 110], even)
+    plane = found_plane(views, poses)
+    assert plane is not None and abs(plane.normal[0]) > np.cos(np.radians(8)) and abs(plane.offset) < 0.05
+    views, poses = views_of_body([-100, -30, 40, 110], odd, lopsided=0.25)
+    other = found_plane(views, poses)
+    assert other is None or abs(other.normal[0]) < 0.9
+
+
+def test_a_body_is_bounded_by_its_mirror_image():
+    """Two views from one side leave the far side open; mirrored, the outlines bound it from there too."""
+    views, poses = views_of_body([60, 100], even)
+    o = Growth(nodes=28, steps=40, viewpoints=60)
+    across = views_from(np.array([[0.0, 0.3, 1.0], [0.0, 0.5, -1.0]]), 5.0)
+    truth, at = views_of_body([0, 180], even)
+    width = [np.ptp(np.nonzero(v.mask.any(0))[0]) / SIDE * 5.0 * SIDE / v.camera.fx for v in truth]
+    plain, twice = (
+        body_of(views, poses, across, PARTS, o, steps=o.steps, seed=0, plane=p) for p in (None, Plane(np.array([1.0, 0.0, 0.0]), 0.0))
+    )
+    assert len(twice.poses) == 2 and len(at) == 2
+
+    def widths(body):
+        _, alpha = body.render(across)
+        return [np.ptp(np.nonzero((a > 0.5).any(0))[0]) / a.shape[1] * 5.0 * a.shape[1] / c.fx for a, c in zip(alpha, across, strict=True)]
+
+    assert np.mean(np.abs(np.subtract(widths(twice), width))) < 0.5 * np.mean(np.abs(np.subtract(widths(plain), width)))
+
+
+def test_planes_are_scored_by_where_they_put_the_pictures():
+    views, poses = views_of_body([-100, -30, 40, 110], even)
+    o = Growth(nodes=28, steps=40)
+    cameras = views_from(directions_around(400), 5.0)
+    body = body_of(views, poses, cameras, PARTS, o, steps=o.steps, seed=0)
+    normals = np.array([[1.0, 0, 0], [0, 1.0, 0], [0.7, 0.7, 0.1], [0, 0.6, 0.8]])
+    score = plane_scores(normals / np.linalg.norm(normals, axis=1, keepdims=True), flipped_views(views, PARTS), poses, body.gallery)
+    assert score.argmax() == 0 and score[0] > 0.8 and len(crops_of(views)) == 4
