@@ -15,15 +15,15 @@ import numpy as np
 from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_bodies import Body, body_of
-from relit.fit.instance_lookahead import branch_values, eyes_at
+from relit.fit.instance_lookahead import branch_values
 from relit.fit.instance_options import Growth
-from relit.fit.instances import View, first_pose
+from relit.fit.instances import View, eyes_at, first_pose
 from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Crop, Rings, chosen_rings, directions_around, refine, search, views_from
 
 ANOTHER = 25.0  # degrees from which on a pose is another one
 TRUST = 1.0  # of what becomes of the others, in the lead of the one that joins
-FEW = 4  # members up to which, as long as no plane of symmetry is known, leads are less believed
+FEW = 4  # members; fewer than that, which do not tell a plane of symmetry, need larger leads
 AT_ONCE = 12  # members for each further one that may join unsure of its place at the same time: one does not spoil a model of many
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from relit.fit.instance_bodies import body_of
 from relit.fit.instance_options import Growth
-from relit.fit.instances import View
+from relit.fit.instances import View, eyes_at
 from relit.fit.mirror_plane import Flipped, Plane
 from relit.fit.register import Crop, Rings, chosen_rings, directions_around, refine, search, views_from
 from relit.geometry.hull import NoShape
@@ -74,8 +74,3 @@ def heights_of(
     body = body_of(some, poses[members], cameras, parts, o, steps=o.ahead_steps, seed=seed, pictures=pictures, plane=plane)
     found = search(others, body.gallery, keep=1, rings=theirs)
     return refine(others, found.poses[:, 0], body.render, rings=theirs, steps=(0, 4.0, 2.0), parts=parts)[1]
-
-
-def eyes_at(poses: np.ndarray) -> float:
-    """Median distance of cameras at `poses` (N, 4, 4) from the object's middle."""
-    return float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))

@@ -13,8 +13,8 @@ from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_growth import ANOTHER, grow
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Search
-from relit.fit.instances import View, albedo_render, carved, fit_model
-from relit.fit.register import Crop, chosen_rings, crop_photo, crop_rings, directions_around, make_gallery, refine, views_from
+from relit.fit.instances import View, albedo_render, carved, crops_of, eyes_at, fit_model
+from relit.fit.register import chosen_rings, crop_rings, directions_around, make_gallery, refine, views_from
 from relit.geometry.hull import NoShape
 
 UNSURE = 0.3  # see `ambiguous`
@@ -23,10 +23,6 @@ LOW = 0.1  # see `regrown`: so much below the median
 REGROWN = 2  # times at most
 STILL = 0.5  # degrees; descents that turn instances by less have arrived
 SLACK = 0.005  # of the mean agreement by which two fits of the same poses may differ
-
-
-def crops_of(views: list[View]) -> list[Crop]:
-    return [crop_photo(v.rgb, v.mask, v.camera.with_pose(np.eye(4)), v.known) for v in views]
 
 
 def settle(views, crops, rings, poses, scores, o: Search, rounds: int, *, seed: int, parts=DETAILED, say=lambda text: None):
@@ -44,7 +40,7 @@ def settle(views, crops, rings, poses, scores, o: Search, rounds: int, *, seed: 
         render = albedo_render(model)
         poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 8.0, 4.0, 2.0), parts=parts)
         moved = np.zeros(len(views), bool)
-        far = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
+        far = eyes_at(poses)
         gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed + turn), far), parts)
         found = look_for(views, crops, gallery, rings, parts, keep=3)
         for k in range(3):
@@ -189,7 +185,7 @@ def ambiguous(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0)
     parts, crops = DETAILED, crops_of(views)
     rings = crop_rings(crops, parts)
     render, own = model_of_all(views, poses, o, seed=seed)
-    far = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
+    far = eyes_at(poses)
     gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed), far), parts)
     found = look_for(views, crops, gallery, rings, parts, keep=3, apart=ANOTHER)
     best, angle = own - UNSURE * (1 - own), np.zeros(len(views))

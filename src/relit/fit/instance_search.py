@@ -18,8 +18,8 @@ from relit.fit.instance_guesses import Guesses, first_pairs, pair_guesses
 from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged
-from relit.fit.instance_rounds import crops_of, settled
-from relit.fit.instances import View, first_pose, frame_scale
+from relit.fit.instance_rounds import settled
+from relit.fit.instances import View, crops_of, first_pose, frame_scale
 from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
 from relit.geometry.hull import NoShape

@@ -24,7 +24,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from relit.conventions import similarity
 from relit.fit.loop import NoStage
 from relit.fit.pixels import PixelBank, corrected, make_bank
-from relit.fit.register import volume_render
+from relit.fit.register import Crop, crop_photo, volume_render
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
@@ -90,6 +90,10 @@ def views_of(
     return out
 
 
+def crops_of(views: list[View]) -> list[Crop]:
+    return [crop_photo(v.rgb, v.mask, v.camera.with_pose(np.eye(4)), v.known) for v in views]
+
+
 def window(a: np.ndarray, top: int, left: int, h: int, w: int) -> np.ndarray:
     """(h, w, ...) of a picture, 0 beyond its border."""
     rows, columns = np.clip([top, top + h], 0, a.shape[0]), np.clip([left, left + w], 0, a.shape[1])
@@ -119,6 +123,11 @@ def frame_scale(views: list[View]) -> float:
         points = np.stack([(x + 0.5 - v.camera.cx) / v.camera.fx, (y + 0.5 - v.camera.cy) / v.camera.fy], -1)
         widest = max(widest, float(np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1).max()))
     return OBJECT_RADIUS / widest
+
+
+def eyes_at(poses: np.ndarray) -> float:
+    """Median distance of cameras at `poses` (N, 4, 4) from the object's middle."""
+    return float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
 
 
 def first_pose(view: View, distance: float) -> np.ndarray:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relit.cameras.se3 import rotation_angle
-from relit.fit.instances import View, nearest_pixels
+from relit.conventions import similarity
+from relit.fit.instances import View, crops_of, nearest_pixels
 from relit.fit.register import (
     TURNS,
     Crop,
@@ -22,7 +23,6 @@ from relit.fit.register import (
     Rings,
     all_scores,
     chosen_rings,
-    crop_photo,
     crop_rings,
     directions_around,
     refine,
@@ -32,13 +32,13 @@ from relit.scene import Camera
 
 FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])  # of a camera's axes, for a picture that is flipped left to right
 NORMALS = 400  # planes that are tried, 7 degrees apart
-JUDGED, SETTLED = 24, 4  # of these by the silhouettes too, and after the flipped pictures have settled
+JUDGED, OTHERS, SETTLED = 24, 8, 4  # of these by the silhouettes too, and after the flipped pictures have settled
 NODES, BINS = 28, 14  # of the body inside the silhouettes, and of their windows, a side
 OFFSETS = np.linspace(-0.16, 0.16, 9)  # of a plane from the middle of the model's frame, which lies somewhere in the object
 EVEN = 0.004  # shares of the silhouettes that differ by less tell nothing
 COVER = 2.0  # weight of the share of the silhouettes beside the scores of pictures
 ANOTHER_PLANE = 25.0  # degrees
-LEAD, LEAD_OF_TWO = 0.035, 0.1  # of the best plane over the next one, and where two instances alone tell it (see benchmarks/RESULTS.md)
+LEAD, LEAD_OF_TWO = 0.035, 0.1  # of the best plane over the next one; the second where two instances tell it (benchmarks/RESULTS.md)
 KEEP = 0.03  # added to the scores of planes near the last one
 SLID = 20.0  # degrees
 CLOSE = 3  # renderings next to where a plane puts a picture, of which the best counts
@@ -54,10 +54,7 @@ class Plane:
     @property
     def mirror(self) -> np.ndarray:
         """(4, 4) the reflection."""
-        out = np.eye(4)
-        out[:3, :3] -= 2 * np.outer(self.normal, self.normal)
-        out[:3, 3] = 2 * self.offset * self.normal
-        return out
+        return similarity(np.eye(3) - 2 * np.outer(self.normal, self.normal), 2 * self.offset * self.normal)
 
     def flipped(self, poses: np.ndarray) -> np.ndarray:
         """Poses (N, 4, 4) object_from_camera of the flipped pictures of cameras at `poses`."""
@@ -77,8 +74,7 @@ class Flipped:
 
 def flipped_views(views: list[View], parts) -> Flipped:
     """All views, flipped. The cameras' poses stay: they are those of the photo that is flipped."""
-    some = [flip(v) for v in views]
-    crops = [crop_photo(v.rgb, v.mask, v.camera.with_pose(np.eye(4)), v.known) for v in some]
+    crops = crops_of([flip(v) for v in views])
     return Flipped(crops, crop_rings(crops, parts))
 
 
@@ -102,28 +98,36 @@ def find_plane(
     normals = half[half[:, 2] > 0]
     score = plane_scores(normals, pictures, poses, gallery)
     hull = Hull(views, poses)
-    order = np.argsort(-score)[:JUDGED]
-    normals, score = normals[order], score[order] + COVER * np.array([hull.offset(n)[0] for n in normals[order]])
+    # the likeliest by appearance, and the likeliest of other directions, so that the best one has others to lead over
+    judged = np.unique([*np.argsort(-score)[:JUDGED], *apart(normals, score)[:OTHERS]])
+    shares, offsets = np.array([hull.offset(n) for n in normals[judged]]).T
+    normals, score = normals[judged], score[judged] + COVER * shares
+    chosen = apart(normals, score)[:SETTLED]
+    looked_at = [settled_plane(Plane(normals[k], offsets[k]), hull, pictures, poses, render, parts, last) for k in chosen]
+    (best, plane), *others = sorted(looked_at, key=lambda one: -one[0])
+    return plane if best - others[0][0] >= (LEAD if len(poses) > 2 else LEAD_OF_TWO) else None
+
+
+def apart(normals: np.ndarray, score: np.ndarray) -> list[int]:
+    """Planes from the best score down, each ANOTHER_PLANE degrees or more from those before it."""
     chosen: list[int] = []
     for k in np.argsort(-score).tolist():
-        if all(np.abs(normals[k] @ normals[j]) < np.cos(np.radians(ANOTHER_PLANE)) for j in chosen):
+        if all(abs(normals[k] @ normals[j]) < np.cos(np.radians(ANOTHER_PLANE)) for j in chosen):
             chosen.append(k)
-    looked_at = [settled_plane(normals[k], hull, pictures, poses, render, parts, last) for k in chosen[:SETTLED]]
-    (best, plane), *others = sorted(looked_at, key=lambda one: -one[0])
-    return plane if not others or best - others[0][0] >= (LEAD if len(poses) > 2 else LEAD_OF_TWO) else None
+    return chosen
 
 
 def settled_plane(
-    normal: np.ndarray, hull: Hull, pictures: Flipped, poses: np.ndarray, render: Render, parts, last: Plane | None
+    first: Plane, hull: Hull, pictures: Flipped, poses: np.ndarray, render: Render, parts, last: Plane | None
 ) -> tuple[float, Plane]:
     """(score, plane) after the flipped pictures have settled on the model; one that slides off to another plane counts as it was."""
-    start = Plane(normal, hull.offset(normal)[1]).flipped(poses)
+    start = first.flipped(poses)
     found, own = refine(pictures.crops, start, render, rings=pictures.rings, steps=(0, 5.0, 2.5), parts=parts)
     slid = np.array([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(found, start, strict=True)]) > SLID
     if slid.any():
         _, there = refine(pictures.crops, start, render, rings=pictures.rings, steps=(0,), parts=parts)
         own = np.where(slid, there, own)
-    better = normal_between(poses, found, normal)
+    better = normal_between(poses, found, first.normal)
     share, offset = hull.offset(better)
     kept = KEEP if last is not None and abs(better @ last.normal) > np.cos(np.radians(SLID)) else 0.0
     return float(own.mean()) + COVER * share + kept, Plane(better, offset)

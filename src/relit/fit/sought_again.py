@@ -18,8 +18,7 @@ from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_growth import ANOTHER
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED
-from relit.fit.instance_rounds import crops_of
-from relit.fit.instances import View, albedo_render, move_poses, moved_poses, pixel_bank
+from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved_poses, pixel_bank
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from
