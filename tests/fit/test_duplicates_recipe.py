@@ -111,7 +111,7 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile), unsure=90.0)
     capture = open_capture(pile)
     assert capture.kind == "duplicates" and len(np.unique(capture.photos[0].load().labels)) == 5
-    small = {"levels": (24,), "level_steps": (12,), "rays": 512, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
+    small = {"levels": (24,), "level_steps": (24,), "rays": 512, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
     options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=64)
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(capture, run, options, 0)
@@ -233,19 +233,20 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     """Who is left out of one pass is not in the next; at most PASSES are made. Poses that textures had to lead back are to stay then."""
     asked = []
 
-    def stage(views, poses, name, number, run, options, seed):
+    def stage(views, poses, name, number, run, options, seed, symmetry):
         asked.append((name, list(views)))
+        assert symmetry == (number or None)  # that of the pass before
         odd = np.array([v == "b" for v in views])
-        return poses + np.where(odd, 0, 1)[:, None, None], odd, number < agree, 2.0 if number < arrives else 0.1
+        return poses + np.where(odd, 0, 1)[:, None, None], odd, number < agree, 2.0 if number < arrives else 0.1, number + 1
 
     monkeypatch.setattr(shape, "joint_stage", stage)
     start = np.zeros((3, 4, 4))
     arrives, agree = 2, 99
-    poses, odd, arrived = shape.joint_stages(["a", "b", "c"], start, None, None, 0)
+    poses, odd, arrived, symmetry = shape.joint_stages(["a", "b", "c"], start, None, None, 0)
     assert [name for name, _ in asked] == ["joint", "joint_2", "joint_3"]
     assert [some for _, some in asked] == [["a", "b", "c"], ["a", "c"], ["a", "c"]]
     assert odd.tolist() == [False, True, False] and poses[:, 0, 0].tolist() == [3, 0, 3] and not start.any()
-    assert arrived
+    assert arrived and symmetry == 3
     asked.clear()
     arrives, agree = 99, 1
     assert not shape.joint_stages(["a", "b", "c"], start, None, None, 0)[2] and len(asked) == 2, "labels and textures agree"

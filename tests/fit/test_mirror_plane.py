@@ -13,7 +13,7 @@ from relit.fit import mirror_plane
 from relit.fit.instance_bodies import body_of
 from relit.fit.instance_options import Growth
 from relit.fit.instances import View
-from relit.fit.mirror_plane import Hull, Plane, find_plane, flip, flipped_views, normal_between, plane_scores, settled_plane
+from relit.fit.mirror_plane import Hull, Plane, find_plane, flip, flipped_poses, flipped_views, normal_between, plane_scores, settled_plane
 from relit.fit.register import directions_around, views_from
 from relit.scene import Camera
 
@@ -63,7 +63,7 @@ def test_a_flipped_picture_shows_the_mirrored_object():
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3))
     mirrored = points @ plane.mirror[:3, :3].T + plane.mirror[:3, 3]
     assert np.allclose(mirrored @ plane.normal + points @ plane.normal, 2 * plane.offset)
-    there = flip(view).camera.with_pose(plane.flipped(pose[None])[0])
+    there = flip(view).camera.with_pose(flipped_poses(plane, pose[None])[0])
     assert np.isclose(np.linalg.det(there.world_from_camera[:3, :3]), 1)
     a, b = view.camera.with_pose(pose).project(points), there.project(mirrored)
     assert np.allclose(a[:, 0] + b[:, 0], SIDE) and np.allclose(a[:, 1:], b[:, 1:])
@@ -84,7 +84,7 @@ def test_silhouettes_tell_where_the_plane_lies():
 def test_the_normal_is_that_of_the_pictures_that_agree():
     _, poses = views_of_body([-60, 10, 70, 150], even)
     normal = np.array([0.8, 0.0, -0.6])
-    placed = Plane(normal, 0.0).flipped(poses)
+    placed = flipped_poses(Plane(normal, 0.0), poses)
     placed[3] = similarity(exp_so3(np.array([0.0, 1.5, 0.3])), np.zeros(3)) @ placed[3]  # one slid away
     start = exp_so3(np.array([0.0, 0.1, 0.0])) @ normal
     assert abs(normal_between(poses, placed, start) @ normal) > 1 - 1e-9

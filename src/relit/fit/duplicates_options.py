@@ -58,6 +58,7 @@ WITHOUT = {
     "search": "what matching does not link is dropped, and of several sets that it links all but the largest",
     "refinement": "poses stay as search has found them",
     "textures": "mesh and poses follow the outlines of the labels alone",
+    "symmetry": "silhouettes bound the object from the sides that show them alone, also where it is its own mirror image",
     "visibility": "no instance, and no ground, shadows another",
     "normals": "normal priors are not used",
     "metal": "no term pulls metallic to 0 or 1",

@@ -16,6 +16,7 @@ from relit.fit.duplicates_poses import named
 from relit.fit.instance_options import Search
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
+from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views
 from relit.fit.odd_instances import odd_instances, view_errors
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
@@ -27,6 +28,7 @@ from relit.geometry.atlas import unwrap
 from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
+from relit.geometry.symmetry import Plane
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.run import run_arrays
 from relit.scene import Mesh
@@ -103,54 +105,72 @@ def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: Dup
 
 
 def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool, arrived) after a first volume pass, and others while textures say that poses are still on their way (at most
-    PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with the model of all. A shape
-    that grew up with better poses is sharper, and moves them on. arrived: textures brought the poses back to where they had been before the
-    last pass, and another one would only lead them away again."""
-    poses, odd, arrived = poses.copy(), np.zeros(len(views), bool), False
+    """(poses, odd (N,) bool, arrived, symmetry or None) after a first volume pass, and others while textures say that poses are still on
+    their way (at most PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with the
+    model of all. A shape that grew up with better poses is sharper, and moves them on. arrived: textures brought the poses back to
+    where they had been before the last pass, and another one would only lead them away again."""
+    poses, odd, arrived, symmetry = poses.copy(), np.zeros(len(views), bool), False, None
     for number in range(PASSES):
         rest = np.flatnonzero(~odd)
         name = "joint" if number == 0 else f"joint_{number + 1}"
-        poses[rest], odd[rest], disagree, turn = joint_stage([views[k] for k in rest], poses[rest], name, number, run, options, seed)
+        some = [views[k] for k in rest]
+        poses[rest], odd[rest], disagree, turn, symmetry = joint_stage(some, poses[rest], name, number, run, options, seed, symmetry)
         arrived = disagree and turn < ARRIVED
         if arrived or not disagree:
             break
-    return poses, odd, arrived
+    return poses, odd, arrived, symmetry
 
 
-def joint_stage(views: list[View], poses: np.ndarray, name: str, number: int, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool, disagree, turn) after one such pass. Textures are asked here already: what the pass has built in the wrong
-    place it does not take back. disagree: they did not agree with poses that follow the labels alone. turn: degrees by which the pass has
-    turned the instances, the median."""
+def joint_stage(
+    views: list[View], poses: np.ndarray, name: str, number: int, run, options: DuplicatesOptions, seed: int, symmetry: Symmetry | None
+):
+    """(poses, odd (N,) bool, disagree, turn, symmetry) after one such pass. Textures are asked here already: what the pass has built in the
+    wrong place it does not take back. disagree: they did not agree with poses that follow the labels alone. turn: degrees by which the
+    pass has turned the instances, the median. symmetry: of the shape of the pass before, and of this one's; None where it is not
+    even."""
     if run.done(name):
         saved = run_arrays(run, name, "joint")
-        return saved["poses"], saved["odd"], bool(saved.get("disagree", False)), float(saved.get("turn", 0))
+        return saved["poses"], saved["odd"], bool(saved.get("disagree", False)), float(saved.get("turn", 0)), saved_symmetry(saved)
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
         before, disagree = poses, False
-        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed)
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry)
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
+        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         if "textures" not in options.without:
-            mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
-            _, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
-            poses[~odd] = moved if disagree else poses[~odd]
+            better, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
+            mesh, poses[~odd] = (better, moved) if disagree else (mesh, poses[~odd])
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
-        stage.save("joint", poses=poses, odd=odd, disagree=disagree, turn=turn)
-    return poses, odd, disagree, turn
+        symmetry = None if "symmetry" in options.without else find_symmetry(mesh)
+        if number == 0 and symmetry is not None:
+            run.say("the object is its own mirror image: its silhouettes bound it from both sides")
+        told = {}
+        if symmetry is not None:
+            told = {"mirror": np.array([*symmetry.plane.normal, symmetry.plane.offset])}
+            told |= {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals}
+        stage.save("joint", poses=poses, odd=odd, disagree=disagree, turn=turn, **told)
+    return poses, odd, disagree, turn, symmetry
+
+
+def saved_symmetry(saved: dict[str, np.ndarray]) -> Symmetry | None:
+    """What `joint_stage` has kept of it."""
+    if "mirror" not in saved:
+        return None
+    return Symmetry(Plane(saved["mirror"][:3], float(saved["mirror"][3])), Mesh(saved["vertices"], saved["faces"], saved["normals"]))
 
 
 def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):
     """(views, poses, model, arrived: see `joint_stages`) after the volume pass, from the poses of the first ones. Instances that do not
     agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished model."""
-    arrived = False
+    arrived, symmetry = False, None
     if pose_rate(views, options) > 0:
-        poses, odd, arrived = joint_stages(views, poses, run, options, seed)
+        poses, odd, arrived, symmetry = joint_stages(views, poses, run, options, seed)
         others = [*others, *(views[k] for k in np.flatnonzero(odd))]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
-        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, still=arrived)
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still=arrived)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
             views, poses = with_found(views, poses, others, model, bank, run, seed)
         return views, poses, model, arrived
@@ -175,12 +195,16 @@ def pose_rate(views: list[View], options: DuplicatesOptions) -> float:
     return 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
 
 
-def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: DuplicatesOptions, seed: int, still: bool = False):
-    """One volume pass: (model, its pixel bank, poses). still: the poses stay as they are."""
+def shape_and_poses(
+    views: list[View], poses: np.ndarray, run, stage, options: DuplicatesOptions, seed: int, symmetry=None, still: bool = False
+):
+    """One volume pass: (model, its pixel bank, poses). symmetry: of the shape of the pass before, or None. still: the poses stay as they
+    are."""
     bank = pixel_bank(views, poses)
     inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
+    beside, there = mirrored_views(symmetry, views, poses) if symmetry else ([], np.zeros((0, 4, 4)))
     try:
-        values = carved(views, poses, options.levels[0], 0.15, Search.depth, crossed=True)
+        values = carved([*views, *beside], np.concatenate([poses, there]), options.levels[0], 0.15, Search.depth, crossed=True)
     except NoShape:
         raise UserError(
             "the silhouettes have nothing in common",
@@ -192,6 +216,7 @@ def shape_and_poses(views: list[View], poses: np.ndarray, run, stage, options: D
     scene = related(views, poses, run)
     model.appearance = shade_world if len(scene.motions) == 1 else partial(shade_world, turns=light_turns(views, scene))
     model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
+    model.mirrored = symmetry and mirrored_rays(symmetry, bank, beside)
     rate = 0.0 if still else pose_rate(views, options)
     if rate > 0:
         move_poses(bank, model)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relit.cameras.se3 import rotation_angle
-from relit.conventions import similarity
 from relit.fit.instances import View, crops_of, nearest_pixels
 from relit.fit.register import (
     TURNS,
@@ -28,6 +27,7 @@ from relit.fit.register import (
     refine,
 )
 from relit.geometry.sdf import node_positions
+from relit.geometry.symmetry import Plane
 from relit.scene import Camera
 
 FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])  # of a camera's axes, for a picture that is flipped left to right
@@ -44,21 +44,9 @@ SLID = 20.0  # degrees
 CLOSE = 3  # renderings next to where a plane puts a picture, of which the best counts
 
 
-@dataclass(frozen=True)
-class Plane:
-    """Points x with normal . x = offset, in the object's frame; normal: (3,), unit."""
-
-    normal: np.ndarray
-    offset: float
-
-    @property
-    def mirror(self) -> np.ndarray:
-        """(4, 4) the reflection."""
-        return similarity(np.eye(3) - 2 * np.outer(self.normal, self.normal), 2 * self.offset * self.normal)
-
-    def flipped(self, poses: np.ndarray) -> np.ndarray:
-        """Poses (N, 4, 4) object_from_camera of the flipped pictures of cameras at `poses`."""
-        return self.mirror @ poses @ FLIP
+def flipped_poses(plane: Plane, poses: np.ndarray) -> np.ndarray:
+    """Poses (N, 4, 4) object_from_camera of the flipped pictures of cameras at `poses`."""
+    return plane.mirror @ poses @ FLIP
 
 
 @dataclass(frozen=True)
@@ -121,7 +109,7 @@ def settled_plane(
     first: Plane, hull: Hull, pictures: Flipped, poses: np.ndarray, render: Render, parts, last: Plane | None
 ) -> tuple[float, Plane]:
     """(score, plane) after the flipped pictures have settled on the model; one that slides off to another plane counts as it was."""
-    start = first.flipped(poses)
+    start = flipped_poses(first, poses)
     found, own = refine(pictures.crops, start, render, rings=pictures.rings, steps=(0, 5.0, 2.5), parts=parts)
     slid = np.array([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(found, start, strict=True)]) > SLID
     if slid.any():
@@ -198,7 +186,7 @@ def plane_scores(normals: np.ndarray, pictures: Flipped, poses: np.ndarray, gall
     axes = np.array([np.asarray(c.world_from_camera)[:3, :3] for c in gallery.cameras])
     total = np.zeros(len(normals))
     for scores, crop, pose in zip(table, pictures.crops, poses, strict=True):
-        placed = np.array([Plane(n, 0.0).flipped(pose) for n in normals])
+        placed = np.array([flipped_poses(Plane(n, 0.0), pose) for n in normals])
         there = placed[:, :3, 3] / np.linalg.norm(placed[:, :3, 3], axis=1, keepdims=True)
         close = np.argsort(-(there @ eyes.T), axis=1)[:, :CLOSE]
         own = placed[:, :3, :3] @ np.asarray(crop.camera.world_from_camera)[:3, :3]

@@ -72,7 +72,9 @@ class VolumeModel:
 
     appearance: another deferred appearance than rendering/shade.py's, called as f(marched, rays, cameras, reflections) -> (radiance
     Color3f premultiplied with opacity, unit normal Vector3f); `reflections` is then whatever flat Float it learns, each entry
-    with its own rate, `rates` (Float, or a function of the step that gives it; times 0.06)."""
+    with its own rate, `rates` (Float, or a function of the step that gives it; times 0.06).
+
+    mirrored: rays that bound the shape besides, mirrored (fit/mirrored.py's MirroredRays), or None."""
 
     grid: SdfGrid
     reflections: Any
@@ -81,6 +83,7 @@ class VolumeModel:
     extra: dict[str, Any] = field(default_factory=dict)
     appearance: Callable | None = None
     rates: Any = 1.0
+    mirrored: Any = None
 
     def shade(self, m: Marched, rays: RayBatch, cameras):
         """Radiance premultiplied with opacity, and unit normal. cameras: as `PixelBank.cameras`."""
@@ -193,9 +196,13 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, m
         dr.enable_grad(*params)
 
         pixel = draw_pixels(bank, rng, count)
+        if model.mirrored is not None:
+            pixel, flipped = model.mirrored.drawn(pixel, rng)
         jitter = rng.next_float32()
         dr.eval(pixel, jitter, rng)
         batch = batch_of(bank, pixel, bank.corrections if refine else None)
+        if model.mirrored is not None:
+            model.mirrored.turned(batch, flipped)
         with dr.suspend_grad():
             t0, t1 = sphere_interval(dr.detach(batch.o), dr.detach(batch.d))
             hit = t1 > t0
@@ -207,6 +214,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, m
             colour = colour + m.transmittance * render_background(model.background, batch.o, batch.d, jitter)
         # with masks, only whole object pixels: silhouettes are the mask term's, which has no preference for dark or bright
         counts = hit & (batch.mask > 0.99) if bank.masked else None
+        if model.mirrored is not None:  # they tell of silhouettes alone
+            counts = counts & ~flipped
         if bank.drop_saturated and not unlimited(bank.saturated):  # "at least this bright", taken at its word, pulls highlights down
             exposed = well_exposed(batch.rgb, saturated_at(bank, batch.view))
             counts = exposed if counts is None else counts & exposed
@@ -217,7 +226,8 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, m
             report["mask"] = term
             loss = loss + mask * term
         if batch.normal is not None:
-            loss = loss + options.normal * normal_loss(normal, batch.normal, batch.has_normal * dr.detach(m.opacity))
+            known = batch.has_normal if model.mirrored is None else dr.select(flipped, 0, batch.has_normal)
+            loss = loss + options.normal * normal_loss(normal, batch.normal, known * dr.detach(m.opacity))
         dr.backward(loss)
 
         smooth, diffusion = smoothness_gradient(grid, dr.opaque(mi.Float, options.eikonal))

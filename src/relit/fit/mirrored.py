@@ -1,0 +1,103 @@
+"""Silhouettes count twice where the object is its own mirror image.
+
+Few views leave the sides of an object open that none of them shows in outline. A ray of a photo, mirrored in the plane of symmetry, meets
+the object as often as the ray itself does, so every silhouette bounds the shape from a second side. What an object looks like need not be
+even, so mirrored rays tell of the shape alone. Where one side has something that the other has not (a handle, a crank), the shape of the
+pass before misses the silhouettes, mirrored, by more than their usual few pixels: there they do not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from relit.fit.instances import View
+from relit.fit.outlines import trace
+from relit.fit.pixels import PixelBank, RayBatch
+from relit.geometry.symmetry import Plane, symmetry_plane
+from relit.rendering.mitsuba_scene import build_geometry
+from relit.scene import Mesh
+
+SAMPLES = 20_000  # points of the surface
+EVEN = 0.02  # unit lengths from its mirror image, on the mean, that a surface may lie to be taken for even
+SHARE = 3  # of so many rays one is mirrored
+THICK = 0.015  # of a window's side: what misses a silhouette by less is the shape's error, not the object's unevenness
+BAND = 0.006  # of a window's side, along outlines: these are for the rays that are not mirrored, for a plane is never quite right
+AROUND = 3  # times as far around what is uneven mirrored rays do not count
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """plane: of symmetry. mesh: the surface that told it, in the same frame."""
+
+    plane: Plane
+    mesh: Mesh
+
+
+@dataclass(frozen=True)
+class MirroredRays:
+    """normal (Vector3f), offset: of the plane. pixels: UInt32, of the bank, from which mirrored rays are drawn."""
+
+    normal: Any
+    offset: Any
+    pixels: Any
+
+    def drawn(self, pixel, rng):
+        """(pixel, mirrored) drawn pixels (UInt32), every SHARE-th drawn anew from those whose mirrored rays count; which (Bool)."""
+        count = dr.width(pixel)
+        mirrored = dr.arange(mi.UInt32, count) % SHARE == 0
+        total = dr.width(self.pixels)
+        k = dr.minimum(mi.UInt32(rng.next_float32() * total), total - 1)
+        return dr.select(mirrored, dr.gather(mi.UInt32, self.pixels, k), pixel), mirrored
+
+    def turned(self, batch: RayBatch, mirrored) -> None:
+        """Mirror those rays of a batch. Poses are for the rays that are not: where the plane is not quite right these would move them."""
+        o, d = dr.detach(batch.o), dr.detach(batch.d)
+        batch.o = dr.select(mirrored, o - 2 * (dr.dot(o, self.normal) - self.offset) * self.normal, batch.o)
+        batch.d = dr.select(mirrored, d - 2 * dr.dot(d, self.normal) * self.normal, batch.d)
+
+
+def find_symmetry(mesh: Mesh) -> Symmetry | None:
+    """The plane in which a mesh in the unit frame is its own mirror image; None where it is not."""
+    points = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), SAMPLES, seed=0)[0]
+    plane, distance = symmetry_plane(np.asarray(points))
+    return Symmetry(plane, mesh) if distance < EVEN else None
+
+
+def mirrored_views(symmetry: Symmetry, views: list[View], poses: np.ndarray) -> tuple[list[View], np.ndarray]:
+    """The views as mirrored cameras have them, and where these stand: nothing is known where the object is not even."""
+    shown = [replace(v, known=v.known * even_pixels(symmetry, v, p)) for v, p in zip(views, poses, strict=True)]
+    return shown, symmetry.plane.mirror @ poses
+
+
+def mirrored_rays(symmetry: Symmetry, bank: PixelBank, shown: list[View]) -> MirroredRays | None:
+    """The rays of the bank that count mirrored, by what is known in `mirrored_views`; None where there are none."""
+    known = np.concatenate([v.known.ravel() for v in shown]) > 0.5
+    candidates = np.array(bank.candidates)
+    chosen = candidates[known[candidates]]
+    if len(chosen) == 0:
+        return None
+    normal = mi.Vector3f(*[dr.opaque(mi.Float, float(x)) for x in symmetry.plane.normal])
+    return MirroredRays(normal, dr.opaque(mi.Float, symmetry.plane.offset), mi.UInt32(chosen))
+
+
+def even_pixels(symmetry: Symmetry, view: View, pose: np.ndarray) -> np.ndarray:
+    """(h, w) bool: pixels off the outline around which the mesh, met by mirrored rays, has the silhouette of the view but for the errors
+    of its shape."""
+    h, w = view.mask.shape
+    thick = max(2, round(THICK * max(h, w)))
+    camera = view.camera.with_pose(symmetry.plane.mirror @ pose)
+    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+    depth, _, _ = trace(build_geometry(symmetry.mesh), camera, x.ravel(), y.ravel())
+    own = view.mask > 0.5
+    wrong = (np.isfinite(depth).reshape(h, w) != own) & (view.known > 0.5)
+    uneven = binary_erosion(wrong, iterations=thick)
+    band = max(1, round(BAND * max(h, w)))
+    told = binary_erosion(own, iterations=band) | ~binary_dilation(own, iterations=band)
+    return told & ~binary_dilation(uneven, iterations=(AROUND + 1) * thick) if uneven.any() else told
