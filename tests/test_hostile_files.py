@@ -14,6 +14,7 @@ import zipfile
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -29,6 +30,7 @@ from relit.conventions import world_from_gl_camera
 from relit.errors import UserError
 from relit.files import load_arrays
 from relit.images import read_header, read_image, read_small, write_linear
+from relit.images.opencv import decode_bytes, decode_file
 from relit.lighting.spherical_gaussians import read_json as read_gaussians
 from relit.masks.files import read_mask
 from relit.scene import Asset, Camera, Flash, Ground, Instance
@@ -81,6 +83,21 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     write_glb(folder / "a.glb", mesh, material)
     np.savez(folder / "a.npz", world_mat_0=np.eye(4), scale_mat_0=np.eye(4))
     return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+def test_a_tiff_of_absurd_width_is_told(tmp_path):
+    """OpenCV raises for it, where it returns nothing for most damaged files."""
+    Image.new("RGB", (16, 1)).save(tmp_path / "a.tif")
+    data = bytearray((tmp_path / "a.tif").read_bytes())
+    first = struct.unpack_from("<I", data, 4)[0]
+    for k in range(struct.unpack_from("<H", data, first)[0]):
+        at = first + 2 + 12 * k
+        if struct.unpack_from("<H", data, at)[0] == 256:  # ImageWidth
+            struct.pack_into("<HII", data, at + 2, 4, 1, 2**21)
+    (tmp_path / "a.tif").write_bytes(data)
+    assert decode_bytes(bytes(data), cv2.IMREAD_UNCHANGED) is None and decode_file(tmp_path / "a.tif", cv2.IMREAD_UNCHANGED) is None
+    with pytest.raises(UserError, match=r"a\.tif"):
+        read_image(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.hdr", "a.png", "b.png", "c.png", "a.jpg", "a.tif", "a.webp"])

@@ -17,6 +17,7 @@ from PIL import Image as PilImage
 from relit.asset.parts import Part, merge_parts
 from relit.conventions import linear_from_srgb
 from relit.errors import UserError
+from relit.images.opencv import decode_bytes
 from relit.scene import Material, Mesh
 
 MAX_BYTES = 2 << 30
@@ -142,7 +143,7 @@ def decode_image(data: bytes, name: str) -> np.ndarray:
     if size is not None and size[0] * size[1] > MAX_TEXELS:
         what = f"a texture of {size[0]} x {size[1]} pixels is too large"
         raise UserError(what, f"at most {MAX_TEXELS // 10**6} million pixels are read", f"make it smaller: {name}")
-    a = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    a = decode_bytes(data, cv2.IMREAD_UNCHANGED)
     if a is None:
         raise UserError("a texture cannot be decoded", "it is neither PNG nor JPEG, or it is damaged", f"export it again: {name}")
     a = a[..., None] if a.ndim == 2 else a

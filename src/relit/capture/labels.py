@@ -9,6 +9,7 @@ import numpy as np
 
 from relit.capture.frames import read_json
 from relit.errors import UserError
+from relit.images.opencv import decode_file
 from relit.masks.rle import runs_from
 
 LEAST_SIDE = 24  # pixels; smaller objects carry no pose
@@ -24,7 +25,7 @@ def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray
         return _from_cutouts(source, shape)
     if source.suffix.lower() == ".json":
         return _from_coco(source, photo, shape)
-    data = cv2.imread(str(source), cv2.IMREAD_UNCHANGED)
+    data = decode_file(source, cv2.IMREAD_UNCHANGED)
     if data is None:
         raise UserError("the label image cannot be read", "it is damaged or no picture", f"write it again: {source}")
     labels = _numbers(data)
@@ -51,7 +52,7 @@ def _numbers(data: np.ndarray) -> np.ndarray:
 def _from_cutouts(folder: Path, shape: tuple[int, int]) -> np.ndarray:
     labels = np.zeros(shape, np.int32)
     for k, file in enumerate(sorted(folder.glob("*.png")), 1):
-        data = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        data = decode_file(file, cv2.IMREAD_UNCHANGED)
         if data is None or data.ndim != 3 or data.shape[2] != 4 or data.shape[:2] != shape:
             have = (
                 "unreadable"
@@ -85,7 +86,7 @@ def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
                 continue
             name = f"{photo.stem}_{k:06d}.png"
             file = next((f for f in (source.parent / "mask_visib" / name, source.parent / "mask" / name) if f.is_file()), None)
-            mask = None if file is None else cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            mask = None if file is None else decode_file(file, cv2.IMREAD_GRAYSCALE)
             if mask is None or mask.shape != shape:
                 raise UserError(f"no usable mask {name}", "each instance needs its mask at the photo's size", f"see: {source.parent}")
             labels[mask > 127] = k + 1

@@ -52,8 +52,10 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
     if suffix == ".hdr":
         import cv2
 
+        from relit.images.opencv import decode_file
+
         _too_large(path, *hdr_size(path))
-        array = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        array = decode_file(path, cv2.IMREAD_UNCHANGED)
         if array is None:
             raise broken(path, "not a Radiance HDR file")
         return _finite(np.ascontiguousarray(array[..., ::-1]), path), True
@@ -112,8 +114,9 @@ def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
     """OpenCV keeps all 16 bits where Pillow drops the lower eight of a colour file."""
     import cv2
 
-    codes = np.frombuffer(_as_stored(path.read_bytes()), np.uint8)
-    array = cv2.imdecode(codes, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    from relit.images.opencv import decode_bytes
+
+    array = decode_bytes(_as_stored(path.read_bytes()), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if array is None or array.dtype.kind not in "uf":
         raise ValueError("the pixels could not be decoded")
     if array.ndim == 3:

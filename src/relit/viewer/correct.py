@@ -12,6 +12,7 @@ import numpy as np
 from relit.capture.corrections import corrected_masks, corrected_sphere, forget_mask, save_mask, save_sphere, sphere_from_boxes
 from relit.errors import UserError
 from relit.images import encode_jpeg
+from relit.images.opencv import decode_bytes
 from relit.masks.grabcut import box_cut
 from relit.scene import Capture, Photo
 from relit.viewer.photos import shrunk
@@ -136,7 +137,7 @@ def _decoded(body: bytes, size: tuple[int, int]) -> np.ndarray:
     head = body[:8] == b"\x89PNG\r\n\x1a\n" and len(body) > 24
     if not head or (int.from_bytes(body[16:20], "big"), int.from_bytes(body[20:24], "big")) != (w, h):
         raise UserError(f"the mask is no PNG of {w} x {h} pixels")
-    mask = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_GRAYSCALE)
+    mask = decode_bytes(body, cv2.IMREAD_GRAYSCALE)
     if mask is None:
         raise UserError("the mask cannot be decoded")
     return mask.astype(np.float32) / 255
