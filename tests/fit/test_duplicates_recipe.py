@@ -111,7 +111,7 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile), unsure=90.0)
     capture = open_capture(pile)
     assert capture.kind == "duplicates" and len(np.unique(capture.photos[0].load().labels)) == 5
-    small = {"levels": (24,), "level_steps": (24,), "rays": 512, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
+    small = {"levels": (24,), "level_steps": (12,), "rays": 512, "faces": 800, "texture": 32, "surface_steps": 4, "points": 128}
     options = replace(recipe.options_for("draft"), **small, directions=8, light=8, side=64)
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(capture, run, options, 0)

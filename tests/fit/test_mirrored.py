@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,7 @@ from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
 from relit.fit.instances import carved, pixel_bank, views_of
 from relit.fit.loop import NoStage
-from relit.fit.mirrored import MirroredRays, Symmetry, even_pixels, find_symmetry, mirrored_rays, mirrored_views
+from relit.fit.mirrored import MirroredRays, Symmetry, even_pixels, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
 from relit.fit.outlines import trace
 from relit.fit.pixels import RayBatch
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
@@ -100,15 +101,20 @@ def test_what_one_side_alone_has_is_left_out():
 
 def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
     two = body(((0.3, 0.5, 0.4), (0, 0, 0)), ((0.1, 0.1, 0.5), (0, 0.3, 0.3)), ((0.3, 0.1, 0.1), (0, -0.4, 0.2)))
-    found = find_symmetry(two)
+    large, small = ([SimpleNamespace(mask=np.zeros((40, side)))] for side in (134, 133))
+    found = find_symmetry(two, large)
     assert found is not None and abs(found.plane.normal[0]) > 0.999 and abs(found.plane.offset) < 0.005
+    assert find_symmetry(two, small) is None
+    kept = symmetry_from({"poses": np.eye(4), **found.arrays})
+    assert np.array_equal(kept.plane.mirror, found.plane.mirror) and np.array_equal(kept.mesh.faces, two.faces)
+    assert build_geometry(kept.mesh) is not None and symmetry_from({"poses": np.eye(4)}) is None
     crooked = body(
         ((0.3, 0.5, 0.4), (0, 0, 0)),
         ((0.4, 0.1, 0.1), (0.4, 0.4, 0)),
         ((0.1, 0.1, 0.5), (-0.2, -0.3, 0.4)),
         ((0.1, 0.5, 0.1), (0.2, -0.4, -0.4)),
     )
-    assert find_symmetry(crooked) is None
+    assert find_symmetry(crooked, large) is None
 
 
 def test_views_from_one_side_bound_the_other_one_too():

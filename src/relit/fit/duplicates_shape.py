@@ -16,7 +16,7 @@ from relit.fit.duplicates_poses import named
 from relit.fit.instance_options import Search
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
-from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views
+from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
 from relit.fit.odd_instances import odd_instances, view_errors
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
@@ -28,7 +28,6 @@ from relit.geometry.atlas import unwrap
 from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
-from relit.geometry.symmetry import Plane
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.run import run_arrays
 from relit.scene import Mesh
@@ -130,7 +129,7 @@ def joint_stage(
     even."""
     if run.done(name):
         saved = run_arrays(run, name, "joint")
-        return saved["poses"], saved["odd"], bool(saved.get("disagree", False)), float(saved.get("turn", 0)), saved_symmetry(saved)
+        return saved["poses"], saved["odd"], bool(saved.get("disagree", False)), float(saved.get("turn", 0)), symmetry_from(saved)
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
         before, disagree = poses, False
@@ -143,22 +142,11 @@ def joint_stage(
             better, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
             mesh, poses[~odd] = (better, moved) if disagree else (mesh, poses[~odd])
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
-        symmetry = None if "symmetry" in options.without else find_symmetry(mesh)
+        symmetry = None if "symmetry" in options.without else find_symmetry(mesh, views)
         if number == 0 and symmetry is not None:
             run.say("the object is its own mirror image: its silhouettes bound it from both sides")
-        told = {}
-        if symmetry is not None:
-            told = {"mirror": np.array([*symmetry.plane.normal, symmetry.plane.offset])}
-            told |= {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals}
-        stage.save("joint", poses=poses, odd=odd, disagree=disagree, turn=turn, **told)
+        stage.save("joint", poses=poses, odd=odd, disagree=disagree, turn=turn, **(symmetry.arrays if symmetry else {}))
     return poses, odd, disagree, turn, symmetry
-
-
-def saved_symmetry(saved: dict[str, np.ndarray]) -> Symmetry | None:
-    """What `joint_stage` has kept of it."""
-    if "mirror" not in saved:
-        return None
-    return Symmetry(Plane(saved["mirror"][:3], float(saved["mirror"][3])), Mesh(saved["vertices"], saved["faces"], saved["normals"]))
 
 
 def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):

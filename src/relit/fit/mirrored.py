@@ -19,7 +19,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from relit.fit.instances import View
 from relit.fit.outlines import trace
-from relit.fit.pixels import PixelBank, RayBatch
+from relit.fit.pixels import PixelBank, RayBatch, drawn_from
 from relit.geometry.symmetry import Plane, symmetry_plane
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Mesh
@@ -27,6 +27,7 @@ from relit.scene import Mesh
 SAMPLES = 20_000  # points of the surface
 EVEN = 0.02  # unit lengths from its mirror image, on the mean, that a surface may lie to be taken for even
 SHARE = 3  # of so many rays one is mirrored
+LEAST = 2  # pixels that THICK must be: smaller pictures do not tell an uneven object from a shape that is wrong
 THICK = 0.015  # of a window's side: what misses a silhouette by less is the shape's error, not the object's unevenness
 BAND = 0.006  # of a window's side, along outlines: these are for the rays that are not mirrored, for a plane is never quite right
 AROUND = 3  # times as far around what is uneven mirrored rays do not count
@@ -39,10 +40,23 @@ class Symmetry:
     plane: Plane
     mesh: Mesh
 
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a stage keeps of it, see `symmetry_from`."""
+        plane = np.array([*self.plane.normal, self.plane.offset])
+        return {"mirror": plane, "vertices": self.mesh.vertices, "faces": self.mesh.faces, "normals": self.mesh.normals}
+
+
+def symmetry_from(saved: dict[str, np.ndarray]) -> Symmetry | None:
+    """The symmetry among the arrays of a stage; None where it has kept none."""
+    if "mirror" not in saved:
+        return None
+    return Symmetry(Plane(saved["mirror"][:3], float(saved["mirror"][3])), Mesh(saved["vertices"], saved["faces"], saved["normals"]))
+
 
 @dataclass(frozen=True)
 class MirroredRays:
-    """normal (Vector3f), offset: of the plane. pixels: UInt32, of the bank, from which mirrored rays are drawn."""
+    """For a bank with masks. normal (Vector3f), offset: of the plane. pixels: UInt32, of the bank, from which mirrored rays are drawn."""
 
     normal: Any
     offset: Any
@@ -50,11 +64,8 @@ class MirroredRays:
 
     def drawn(self, pixel, rng):
         """(pixel, mirrored) drawn pixels (UInt32), every SHARE-th drawn anew from those whose mirrored rays count; which (Bool)."""
-        count = dr.width(pixel)
-        mirrored = dr.arange(mi.UInt32, count) % SHARE == 0
-        total = dr.width(self.pixels)
-        k = dr.minimum(mi.UInt32(rng.next_float32() * total), total - 1)
-        return dr.select(mirrored, dr.gather(mi.UInt32, self.pixels, k), pixel), mirrored
+        mirrored = dr.arange(mi.UInt32, dr.width(pixel)) % SHARE == 0
+        return dr.select(mirrored, drawn_from(self.pixels, rng), pixel), mirrored
 
     def turned(self, batch: RayBatch, mirrored) -> None:
         """Mirror those rays of a batch. Poses are for the rays that are not: where the plane is not quite right these would move them."""
@@ -63,8 +74,10 @@ class MirroredRays:
         batch.d = dr.select(mirrored, d - 2 * dr.dot(d, self.normal) * self.normal, batch.d)
 
 
-def find_symmetry(mesh: Mesh) -> Symmetry | None:
-    """The plane in which a mesh in the unit frame is its own mirror image; None where it is not."""
+def find_symmetry(mesh: Mesh, views: list[View]) -> Symmetry | None:
+    """The plane in which a mesh in the unit frame is its own mirror image; None where it is not, or the views are too small to tell."""
+    if THICK * np.median([max(v.mask.shape) for v in views]) < LEAST:
+        return None
     points = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), SAMPLES, seed=0)[0]
     plane, distance = symmetry_plane(np.asarray(points))
     return Symmetry(plane, mesh) if distance < EVEN else None
@@ -91,7 +104,7 @@ def even_pixels(symmetry: Symmetry, view: View, pose: np.ndarray) -> np.ndarray:
     """(h, w) bool: pixels off the outline around which the mesh, met by mirrored rays, has the silhouette of the view but for the errors
     of its shape."""
     h, w = view.mask.shape
-    thick = max(2, round(THICK * max(h, w)))
+    thick = max(LEAST, round(THICK * max(h, w)))
     camera = view.camera.with_pose(symmetry.plane.mirror @ pose)
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     depth, _, _ = trace(build_geometry(symmetry.mesh), camera, x.ravel(), y.ravel())

@@ -220,6 +220,10 @@ def unlimited(saturated) -> bool:
 
 def draw_pixels(bank: PixelBank, rng, count: int):
     """`count` candidate pixels, uniformly. rng: evaluated PCG32 of size `count`."""
-    total = dr.width(bank.candidates)
-    k = dr.minimum(mi.UInt32(rng.next_float32() * total), total - 1)
-    return dr.gather(mi.UInt32, bank.candidates, k)
+    return drawn_from(bank.candidates, rng)
+
+
+def drawn_from(pixels, rng):
+    """As many of `pixels` (UInt32) as the rng (PCG32) is wide, uniformly."""
+    total = dr.width(pixels)
+    return dr.gather(mi.UInt32, pixels, dr.minimum(mi.UInt32(rng.next_float32() * total), total - 1))

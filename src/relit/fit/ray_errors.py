@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.losses import display_weight
-from relit.fit.pixels import PixelBank, batch_of
+from relit.fit.pixels import PixelBank, batch_of, drawn_from
 from relit.fit.volume import VolumeModel
 from relit.rendering.march import march, sphere_interval
 
@@ -30,8 +30,7 @@ def ray_errors(bank: PixelBank, model: VolumeModel, count: int, seed: int) -> Ra
     """Of `count` drawn rays of the object's pixels, the same for the same seed, from the cameras as they have been corrected."""
     rng = mi.PCG32(size=count, initstate=seed + 77)
     with dr.suspend_grad():
-        k = dr.minimum(mi.UInt32(rng.next_float32() * dr.width(bank.candidates)), dr.width(bank.candidates) - 1)
-        batch = batch_of(bank, dr.gather(mi.UInt32, bank.candidates, k), bank.corrections)
+        batch = batch_of(bank, drawn_from(bank.candidates, rng), bank.corrections)
         t0, t1 = sphere_interval(batch.o, batch.d)
         dr.eval(batch.o, batch.d, batch.rgb, batch.mask, batch.view, t0, t1)
         m = march(model.grid, batch.o, batch.d, t0, t1, dr.opaque(mi.Float, model.inv_s), dr.opaque(mi.Float, model.grid.h))
