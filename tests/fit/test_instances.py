@@ -176,7 +176,14 @@ def test_what_is_believed_was_sure_of_its_places_and_agrees_all_over():
     placed = Placed(np.tile(np.eye(4), (10, 1, 1)), own, (0, 1), (4,), DETAILED)
     assert believed(placed, o) and not believed(None, o)
     assert not believed(replace(placed, unsure=(4, 5)), o)
-    assert not believed(replace(placed, own=np.where(np.arange(10) == 3, 0.9 - 1.1 * LOW, own)), o)
+
+    def agrees_less(*who):
+        return replace(placed, own=np.where(np.isin(np.arange(10), who), 0.9 - 1.1 * LOW, own))
+
+    assert not believed(agrees_less(3), o)  # another one than the one who was unsure
+    assert believed(agrees_less(4), o) and believed(replace(agrees_less(3), unsure=()), o)
+    few = Placed(placed.poses[:6], own[:6], (0, 1), (), DETAILED)
+    assert believed(few, o) and not believed(replace(few, own=np.array([0.9, 0.9, 0.9 - 1.1 * LOW, 0.9, 0.9, 0.9])), o)
 
 
 def test_those_who_were_unsure_are_asked_again_once_all_others_stand(monkeypatch):

@@ -30,7 +30,7 @@ ALIKE = 15.0  # degrees within which links tell the same turn
 @dataclass(frozen=True)
 class Found:
     """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances. sure: nearly all of them were sure of
-    their places, and none agrees much less than the others."""
+    their places and agree about as well as the others (`instance_regrowth.believed`)."""
 
     poses: np.ndarray
     scores: np.ndarray
