@@ -37,18 +37,21 @@ def body(*parts) -> Mesh:
     return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32), np.asarray(whole.vertex_normals, np.float32))
 
 
+def around(angles) -> np.ndarray:
+    """Poses of cameras that are turned by `angles` (degrees about +y)."""
+    turns = [exp_so3(np.array([0.0, np.radians(a), 0.0])) for a in angles]
+    return np.array([similarity(turn, -4.0 * turn[:, 2]) for turn in turns])
+
+
 def views_of_mesh(mesh: Mesh, angles) -> tuple[list, np.ndarray]:
     """Grey views of a mesh, turned by `angles` (degrees about +y), and their poses."""
     camera = Camera(SIDE, SIDE, 200.0, 200.0, SIDE / 2, SIDE / 2, np.eye(4))
     x, y = (a.ravel() + 0.5 for a in np.meshgrid(np.arange(SIDE), np.arange(SIDE)))
-    views, poses = [], []
-    for k, a in enumerate(angles):
-        turn = exp_so3(np.array([0.0, np.radians(a), 0.0]))
-        pose = similarity(turn, -4.0 * turn[:, 2])
+    views, poses = [], around(angles)
+    for k, pose in enumerate(poses):
         mask = np.isfinite(trace(build_geometry(mesh), camera.with_pose(pose), x, y)[0]).reshape(SIDE, SIDE)
         views += views_of(np.repeat(0.4 * mask[..., None], 3, -1).astype(np.float32), mask.astype(np.int32) * (k + 1), camera, 10**6)
-        poses.append(pose)
-    return views, np.array(poses)
+    return views, poses
 
 
 def test_rays_are_mirrored_and_only_the_others_move_poses():
@@ -102,9 +105,10 @@ def test_what_one_side_alone_has_is_left_out():
 def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
     two = body(((0.3, 0.5, 0.4), (0, 0, 0)), ((0.1, 0.1, 0.5), (0, 0.3, 0.3)), ((0.3, 0.1, 0.1), (0, -0.4, 0.2)))
     large, small = ([SimpleNamespace(mask=np.zeros((40, side)))] for side in (134, 133))
-    found = find_symmetry(two, large)
+    poses = around([0, 40])  # mirrored at x = 0 the second one looks from 40 degrees beyond the first
+    found = find_symmetry(two, large, poses)
     assert found is not None and abs(found.plane.normal[0]) > 0.999 and abs(found.plane.offset) < 0.005
-    assert find_symmetry(two, small) is None
+    assert find_symmetry(two, small, poses) is None
     kept = symmetry_from({"poses": np.eye(4), **found.arrays})
     assert np.array_equal(kept.plane.mirror, found.plane.mirror) and np.array_equal(kept.mesh.faces, two.faces)
     assert build_geometry(kept.mesh) is not None and symmetry_from({"poses": np.eye(4)}) is None
@@ -114,7 +118,8 @@ def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
         ((0.1, 0.1, 0.5), (-0.2, -0.3, 0.4)),
         ((0.1, 0.5, 0.1), (0.2, -0.4, -0.4)),
     )
-    assert find_symmetry(crooked, large) is None
+    assert find_symmetry(crooked, large, poses) is None
+    assert find_symmetry(two, large, around([-70, -40, -25, 0, 30, 65])) is None  # what mirrored views show is seen already
 
 
 def test_views_from_one_side_bound_the_other_one_too():

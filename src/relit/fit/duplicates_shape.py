@@ -142,7 +142,7 @@ def joint_stage(
             better, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
             mesh, poses[~odd] = (better, moved) if disagree else (mesh, poses[~odd])
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
-        symmetry = None if "symmetry" in options.without else find_symmetry(mesh, views)
+        symmetry = None if "symmetry" in options.without else find_symmetry(mesh, views, poses)
         if number == 0 and symmetry is not None:
             run.say("the object is its own mirror image: its silhouettes bound it from both sides")
         stage.save("joint", poses=poses, odd=odd, disagree=disagree, turn=turn, **(symmetry.arrays if symmetry else {}))

@@ -3,7 +3,8 @@
 Few views leave the sides of an object open that none of them shows in outline. A ray of a photo, mirrored in the plane of symmetry, meets
 the object as often as the ray itself does, so every silhouette bounds the shape from a second side. What an object looks like need not be
 even, so mirrored rays tell of the shape alone. Where one side has something that the other has not (a handle, a crank), the shape of the
-pass before misses the silhouettes, mirrored, by more than their usual few pixels: there they do not count.
+pass before misses the silhouettes, mirrored, by more than their usual few pixels: there they do not count. Where many views stand all
+around the object, mirrored ones have nothing left to tell, and there are none.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from relit.fit.instance_growth import seen_from
 from relit.fit.instances import View
 from relit.fit.outlines import trace
 from relit.fit.pixels import PixelBank, RayBatch, drawn_from
@@ -31,6 +33,7 @@ LEAST = 2  # pixels that THICK must be: smaller pictures do not tell an uneven o
 THICK = 0.015  # of a window's side: what misses a silhouette by less is the shape's error, not the object's unevenness
 BAND = 0.006  # of a window's side, along outlines: these are for the rays that are not mirrored, for a plane is never quite right
 AROUND = 3  # times as far around what is uneven mirrored rays do not count
+APART = 15.0  # degrees from the next view at which a mirrored view tells nothing new
 
 
 @dataclass(frozen=True)
@@ -74,13 +77,21 @@ class MirroredRays:
         batch.d = dr.select(mirrored, d - 2 * dr.dot(d, self.normal) * self.normal, batch.d)
 
 
-def find_symmetry(mesh: Mesh, views: list[View]) -> Symmetry | None:
-    """The plane in which a mesh in the unit frame is its own mirror image; None where it is not, or the views are too small to tell."""
+def find_symmetry(mesh: Mesh, views: list[View], poses: np.ndarray) -> Symmetry | None:
+    """The plane in which a mesh in the unit frame is its own mirror image; None where it is not, the views are too small to tell, or they
+    stand all around it: half of the mirrored ones within APART of another. Then a plane that is not quite right costs more than it
+    brings."""
     if THICK * np.median([max(v.mask.shape) for v in views]) < LEAST:
         return None
     points = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), SAMPLES, seed=0)[0]
     plane, distance = symmetry_plane(np.asarray(points))
-    return Symmetry(plane, mesh) if distance < EVEN else None
+    return Symmetry(plane, mesh) if distance < EVEN and mirrored_apart(plane, poses) > APART else None
+
+
+def mirrored_apart(plane: Plane, poses: np.ndarray) -> float:
+    """Degrees between each mirrored view and the next one that is not mirrored, the median."""
+    near = (seen_from(plane.mirror @ poses) @ seen_from(poses).T).max(1)
+    return float(np.degrees(np.median(np.arccos(np.clip(near, -1, 1)))))
 
 
 def mirrored_views(symmetry: Symmetry, views: list[View], poses: np.ndarray) -> tuple[list[View], np.ndarray]:
