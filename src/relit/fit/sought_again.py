@@ -31,6 +31,7 @@ TRIES = 12  # places of an instance that are tried, half of them under each desc
 APART = 12.0
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
+ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
 
 
@@ -40,14 +41,18 @@ def sought_again(view: View, guide: View, guide_pose: np.ndarray, model: VolumeM
     guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
     `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo.
     """
-    poses = candidates(view, model, float(np.linalg.norm(guide_pose[:3, 3])), seed)
-    if len(poses) == 0:
-        return None
-    poses, errors = descended(view, guide, guide_pose, poses, model, turns, seed)
-    best = int(np.nanargmin(errors))
-    elsewhere = [e for p, e in zip(poses, errors, strict=True) if rotation_angle(p[:3, :3].T @ poses[best][:3, :3]) > ANOTHER]
-    agrees = errors[best] <= AGREES * level and all(e >= CLEARLY * errors[best] for e in elsewhere)
-    return poses[best] if agrees else None
+    distance = float(np.linalg.norm(guide_pose[:3, 3]))
+    for turn in range(ROUNDS):
+        poses = candidates(view, model, distance, seed + turn)
+        if len(poses) == 0:
+            continue
+        poses, errors = descended(view, guide, guide_pose, poses, model, turns, seed + turn)
+        best = int(np.nanargmin(errors))
+        if errors[best] > AGREES * level:
+            continue
+        elsewhere = [e for p, e in zip(poses, errors, strict=True) if rotation_angle(p[:3, :3].T @ poses[best][:3, :3]) > ANOTHER]
+        return poses[best] if all(e >= CLEARLY * errors[best] for e in elsewhere) else None
+    return None
 
 
 def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:
