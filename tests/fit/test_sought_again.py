@@ -62,13 +62,16 @@ def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
     _, (guide, hidden), poses = lump
     asked = []
 
-    def descended(*rest):
-        seed = rest[-1]
-        asked.append(seed)
-        return poses[[0, 1]] if seed < 6 else poses[[1, 0]], np.array([20.0, 30.0]) if seed < 6 else np.array([3.0, 30.0])
+    def found(errors_of_turn):
+        asked.clear()
 
-    monkeypatch.setattr(module, "candidates", lambda *_: poses[[0, 1]])
-    monkeypatch.setattr(module, "descended", descended)
-    assert np.array_equal(sought_again(hidden, guide, poses[0], None, 1.0, None, 5), poses[1]) and asked == [5, 6]
-    monkeypatch.setattr(module, "descended", lambda *rest: (asked.append(rest[-1]), poses[[0, 1]], np.array([20.0, 30.0]))[1:])
-    assert sought_again(hidden, guide, poses[0], None, 1.0, None, 5) is None and asked[2:] == [5, 6, 7]
+        def descended(*rest):
+            asked.append(rest[-1])
+            return poses[[1, 0]], np.array(errors_of_turn[len(asked) - 1])
+
+        monkeypatch.setattr(module, "descended", descended)
+        return sought_again(hidden, guide, poses[0], None, 1.0, None, 5)
+
+    monkeypatch.setattr(module, "candidates", lambda *_: poses[[1, 0]])
+    assert np.array_equal(found([[20.0, 30.0], [3.0, 30.0]]), poses[1]) and asked == [5, 6]
+    assert found([[20.0, 30.0]] * 3) is None and asked == [5, 6, 7]
