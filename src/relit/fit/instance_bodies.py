@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relit.fit.instance_options import Growth
-from relit.fit.instances import View, albedo_render, carved, fit_model
+from relit.fit.instances import View, albedo_render, fit_model, taut_body
 from relit.fit.mirror_plane import Flipped, Plane, find_plane
 from relit.fit.register import Gallery, Render, make_gallery
 from relit.scene import Camera
@@ -53,7 +53,7 @@ def fitted(
     count = len(views)
     if plane is not None:
         views, poses = [*views, *views], np.concatenate([poses, plane.mirror @ poses])
-    values = carved(views, poses, o.nodes, o.tolerance, o.depth, crossed=count > 3)
+    values = taut_body(views, poses, o.nodes, o.tolerance, o.depth, crossed=count > 3)
     model, moved = fit_model(views, poses, values, steps, refine_cameras=o.rate, rays=o.rays, seed=seed)
     render = albedo_render(model)
     return Body(render, make_gallery(render, cameras, parts), moved[:count], plane)

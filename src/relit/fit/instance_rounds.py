@@ -13,7 +13,7 @@ from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_growth import ANOTHER, grow
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Search
-from relit.fit.instances import View, albedo_render, carved, crops_of, eyes_at, fit_model
+from relit.fit.instances import View, albedo_render, carved, crops_of, eyes_at, fit_model, taut_body
 from relit.fit.register import chosen_rings, crop_rings, directions_around, make_gallery, refine, views_from
 from relit.geometry.hull import NoShape
 
@@ -35,7 +35,7 @@ def settle(views, crops, rings, poses, scores, o: Search, rounds: int, *, seed: 
         use = trusted(scores)
         nodes = o.nodes if turn < 2 else round(1.3 * o.nodes)
         some = [views[k] for k in use]
-        values = carved(some, poses[use], nodes, 0.15, o.depth)
+        values = taut_body(some, poses[use], nodes, 0.15, o.depth)
         model, poses[use] = fit_model(some, poses[use], values, 2 * o.steps, refine_cameras=o.rate, seed=seed + turn)
         render = albedo_render(model)
         poses, scores = refine(crops, poses, render, rings=rings, steps=(0, 8.0, 4.0, 2.0), parts=parts)
@@ -129,7 +129,7 @@ def reconsider(views, crops, rings, poses, scores, o: Search, *, seed: int, part
     for turn, k in enumerate([k for k in np.argsort(scores)[: o.doubted].tolist() if k not in sure]):
         rest = [j for j in range(len(views)) if j != k]
         some = [views[j] for j in rest]
-        values = carved(some, poses[rest], o.nodes, 0.15, o.depth, crossed=len(rest) > 3)
+        values = taut_body(some, poses[rest], o.nodes, 0.15, o.depth, crossed=len(rest) > 3)
         model, _ = fit_model(some, poses[rest], values, 2 * o.steps, seed=seed + turn)
         render, own = albedo_render(model), chosen_rings(rings, [k])
         best, score = refine([crops[k]], poses[[k]], render, rings=own, steps=(0, 4.0, 2.0), parts=parts)

@@ -4,7 +4,7 @@ SfD finds the poses by matching features between the objects (Sec. 3.1; cameras/
 seen from similar sides; what it cannot link is found here by search:
 
     views_of      the photo and its labels -> one virtual camera with picture, mask and what is known for each instance
-    inflated      a crude model from one silhouette; carved: one from the silhouettes of several
+    inflated      a crude model from one silhouette; carved, taut_body: one from the silhouettes of several
     fit_model     a coarse volume model of some instances
 
 Poses are `object_from_camera` of the PHOTO's camera, in the unit frame of the object: instance i in the photo's frame is the inverse,
@@ -28,6 +28,7 @@ from relit.fit.register import Crop, crop_photo, volume_render
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
+from relit.geometry.taut import taut
 from relit.rendering.shade_world import shade_albedo, shade_world, start_world_light
 from relit.scene import Camera
 
@@ -192,6 +193,14 @@ def carved(
         empty += known & out
     inside = (told > 0) & (empty <= tolerance * told) & ((p**2).sum(1) < 0.98)
     return distance_of(inside.reshape(n, n, n))
+
+
+def taut_body(views: list[View], poses: np.ndarray, n: int, tolerance: float, depth: float | None = None, *, crossed: bool = False):
+    """As `carved`, but as round as the silhouettes let it be (geometry/taut.py): of few views the hull has corners and lumps that nobody
+    has seen, and from other sides it does not look like the object."""
+    values = carved(views, poses, n, tolerance, depth, crossed=crossed)
+    cameras = [v.camera.with_pose(pose) for v, pose in zip(views, poses, strict=True)]
+    return taut(values, cameras, [v.mask * v.known for v in views])
 
 
 def fit_model(
