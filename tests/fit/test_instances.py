@@ -27,6 +27,7 @@ from relit.fit.instances import (
     inflated,
     move_poses,
     pixel_bank,
+    taut_body,
     views_of,
 )
 from relit.fit.pile_scene import find_ground
@@ -108,6 +109,26 @@ def test_carving_keeps_what_unknown_pixels_may_hide():
     poses = np.stack([pose, pose])
     blind = replace(v, known=np.ones_like(v.known))
     assert (carved([v, everywhere], poses, 24, 0.0) < 0).sum() > 1.05 * (carved([blind, everywhere], poses, 24, 0.0) < 0).sum()
+
+
+def test_a_taut_body_fills_what_is_known_of_a_silhouette_and_leaves_what_is_only_not_denied():
+    views = views_of(np.zeros((120, 200, 3), np.float32), discs(), CAMERA, 10**6)
+    hidden = views[0]  # the other disc is in front of it
+    pose = first_pose(hidden, frame_scale(views))
+    across = similarity(exp_so3(np.array([0, np.pi / 2, 0])), np.zeros(3)) @ first_pose(views[1], frame_scale(views))
+    views, poses = [hidden, views[1]], np.stack([pose, across])
+    hull, body = carved(views, poses, 40, 0.0) < 0, taut_body(views, poses, 40, 0.0) < 0
+    assert not (body & ~hull).any()
+    q = hidden.camera.with_pose(pose).project(node_positions(40)[body])
+    shown = np.zeros(hidden.mask.shape, np.float32)
+    shown[np.clip(q[:, 1].astype(int), 0, len(shown) - 1), np.clip(q[:, 0].astype(int), 0, shown.shape[1] - 1)] = 1
+    cell = 2 / 39 * hidden.camera.fx / np.linalg.norm(pose[:3, 3])  # pixels
+    near = cv2.dilate(shown, np.ones((2 * int(np.ceil(cell)) + 1,) * 2))
+    assert ((hidden.mask * hidden.known > 0.5) & (near == 0)).mean() < 0.005
+    q = hidden.camera.with_pose(pose).project(node_positions(40)[hull])
+    beside = hidden.known[np.clip(q[:, 1].astype(int), 0, len(shown) - 1), np.clip(q[:, 0].astype(int), 0, shown.shape[1] - 1)] == 0
+    kept = body[hull]
+    assert kept[beside].mean() < kept[~beside].mean()  # where the other disc may hide it, less is left of what the hull allows
 
 
 def test_growth_starts_where_the_next_guess_is_far_worse_and_from_no_pair_twice():
