@@ -368,13 +368,13 @@ def test_poses_are_found_from_silhouettes_and_colours_alone():
     views, truth = painted([0, 20, 40])
     small = {"nodes": 24, "steps": 16, "viewpoints": 200}
     o = Search(**small, models=1, starts=1, descents=1, leaps=-1.0, growth=Growth(**small, keep=1, rays=4096))
-    said = []
-    found = place(views, o, say=said.append)
-    poses, scores = found.poses, found.scores
-    for k in (1, 2):
-        turn, true = (p[k][:3, :3].T @ p[0][:3, :3] for p in (poses, truth))
-        assert rotation_angle(turn.T @ true) < 20
-    assert scores.shape == (3,) and scores.min() > 0.7
+    said, errors = [], []
+    for seed in (0, 1, 2):  # one search of three views that span 40 degrees ends 11 to 21 degrees off
+        found = place(views, o, seed=seed, say=said.append)
+        turns, true = ([p[k][:3, :3].T @ p[0][:3, :3] for k in (1, 2)] for p in (found.poses, truth))
+        errors.append([rotation_angle(a.T @ b) for a, b in zip(turns, true, strict=True)])
+        assert found.scores.shape == (3,) and found.scores.min() > 0.7
+    assert np.median(errors, axis=0).max() < 18
     assert any("uncertain" in text for text in said) and not found.sure
     alone = place(views[:1], o)
     assert alone.poses.shape == (1, 4, 4) and alone.scores.tolist() == [1.0] and alone.sure
