@@ -23,7 +23,7 @@ def picture(inside, camera):
     return covered(p[inside(p)], camera)
 
 
-def covered(points, camera, size=None):
+def covered(points, camera):
     q = camera.project(points)
     shape = (camera.height, camera.width)
     out = np.zeros(shape, np.float32)
