@@ -18,6 +18,7 @@ from relit.fit.instance_guesses import Guesses, first_pairs, pair_guesses
 from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged
+from relit.fit.instance_revolution import place_revolved
 from relit.fit.instance_rounds import settled
 from relit.fit.instances import View, crops_of, first_pose, frame_scale
 from relit.fit.mirror_plane import flipped_views
@@ -30,7 +31,7 @@ ALIKE = 15.0  # degrees within which links tell the same turn
 @dataclass(frozen=True)
 class Found:
     """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances. sure: nearly all of them were sure of
-    their places and agree about as well as the others (`instance_regrowth.believed`)."""
+    their places and agree about as well as the others (`instance_regrowth.believed`), or another search would find the same."""
 
     poses: np.ndarray
     scores: np.ndarray
@@ -77,6 +78,21 @@ def linked_sets(views, links, distance: float) -> list[Branch]:
     return sorted(sets, key=lambda one: -len(one[0]))
 
 
+def turned(views, crops, revolved: Placed, o: Search, *, seed: int, links=(), say=lambda text: None) -> Found:
+    """Bodies of revolution, of which some are not sure of their turn about the axis: they are asked as growth asks them. Where that is not
+    believed they stay as decoration tells them; a search over all poses would lose the axes."""
+    again = confirmed(views, crops, crop_rings(crops, DETAILED), revolved, o, seed=seed, links=links)
+    if believed(again, o):
+        poses, scores = settled(views, crops, crop_rings(crops, DETAILED), again.poses, again.own, o, seed=seed, say=say)
+        return Found(poses, scores, True)
+    return only_axes(revolved, say)
+
+
+def only_axes(revolved: Placed, say) -> Found:
+    say(f"note: {len(revolved.unsure)} of {len(revolved.own)} are not sure of their turn about the axis: their decoration may be mixed")
+    return Found(revolved.poses, revolved.own, True)
+
+
 def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None, step=lambda done, total: None) -> Found:
     """Where all views stand, from nothing but the photo and its labels.
 
@@ -87,6 +103,9 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     if len(views) == 1:
         return Found(first_pose(views[0], distance)[None], np.ones(1), True)
     crops = crops_of(views)
+    revolved = place_revolved(views, crops, o, seed=seed, say=say)
+    if revolved is not None and 2 * len(revolved.unsure) <= len(views):
+        return turned(views, crops, revolved, o, seed=seed, links=links, say=say)
     order = sorted(range(len(views)), key=lambda k: -views[k].seen * np.sqrt(views[k].mask.sum()) / views[k].camera.fx)
     chosen = order[: o.models]
     guesses = pair_guesses(views, crops, chosen, o, distance, seed, step)
@@ -112,6 +131,8 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
             )
             if best is None or believed(placed, o) or placed.agreement > best.agreement:
                 best = placed
+    if revolved is not None and not believed(best, o):
+        return only_axes(revolved, say)
     if best is None:
         raise NoShape("no set of poses agrees with the silhouettes")
     if not believed(best, o) and len(views) > 3:

@@ -1,0 +1,180 @@
+"""Bodies of revolution: axes from outlines, turns from decoration. The pictures are splatted points, with nothing of what is tested."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from relit.cameras.se3 import rotation_angle
+from relit.conventions import similarity
+from relit.fit import instance_search
+from relit.fit.instance_options import Search
+from relit.fit.instance_revolution import CLEAR, EXACT, place_revolved
+from relit.fit.instances import View, crops_of
+from relit.fit.revolution import (
+    adjusted_pose,
+    axis_of,
+    drawn,
+    fit_revolution,
+    leaning_back,
+    outline_of,
+    seats_of,
+)
+from relit.fit.unrolled import LATITUDES, TURNS, Board, Told, cells_of, turned_about, turned_by_decoration
+from relit.scene import Camera
+
+SIDE, FOCAL, AWAY = 96, 190.0, 4.0
+CAMERA = Camera(SIDE, SIDE, FOCAL, FOCAL, SIDE / 2, SIDE / 2, np.eye(4))
+OPTIONS = Search(steps=20, nodes=28)
+
+
+def bottle() -> tuple[np.ndarray, np.ndarray]:
+    """Points (M, 3) and colours (M, 3) of a bottle with random blots."""
+    y, a = np.linspace(-0.75, 0.75, 360), np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    r = np.interp(y, [-0.75, 0.15, 0.4, 0.75], [0.36, 0.36, 0.15, 0.15])
+    side = np.stack([r[:, None] * np.sin(a), np.broadcast_to(y[:, None], (360, 720)), r[:, None] * np.cos(a)], -1)
+    blots = gaussian_filter(np.random.default_rng(5).standard_normal((360, 720, 3)), (14, 22, 0), mode=("nearest", "wrap", "nearest"))
+    colour = np.where(blots > 0.35 * blots.std((0, 1)), 0.6, 0.15)
+    ends = [
+        np.stack([r0 * np.sin(a), np.full(720, h), r0 * np.cos(a)], -1)
+        for h, most in ((-0.75, 0.36), (0.75, 0.15))
+        for r0 in np.linspace(0, most, 80)
+    ]
+    ends = np.concatenate(ends)
+    return np.concatenate([side.reshape(-1, 3), ends]), np.concatenate([colour.reshape(-1, 3), np.full(ends.shape, 0.3)])
+
+
+def ellipsoid(*radii: float) -> tuple[np.ndarray, np.ndarray]:
+    p = np.random.default_rng(0).standard_normal((120000, 3))
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    return p * np.array(radii), 0.2 + 0.5 * (np.sin(9 * p) > 0)
+
+
+def seen(points: np.ndarray, colours: np.ndarray, pose: np.ndarray, label: int) -> View:
+    """The points before the camera, each over those behind it."""
+    at = (points - pose[:3, 3]) @ pose[:3, :3]
+    u, v = (np.floor(FOCAL * at[:, i] / at[:, 2] + SIDE / 2).astype(int) for i in (0, 1))
+    nearest = np.lexsort((-at[:, 2], v * SIDE + u))  # of each pixel the last is the nearest
+    rgb, mask = np.zeros((SIDE, SIDE, 3), np.float32), np.zeros((SIDE, SIDE), np.float32)
+    rgb[v[nearest], u[nearest]], mask[v[nearest], u[nearest]] = colours[nearest], 1
+    return View(label, CAMERA, rgb, mask, np.ones((SIDE, SIDE), np.float32), 1.0)
+
+
+def pile(points, colours, count: int, seed: int) -> tuple[list[View], np.ndarray]:
+    turns = Rotation.random(count, random_state=seed).as_matrix()
+    poses = np.array([similarity(r, -AWAY * r @ np.array([0.02, -0.03, 1.0])) for r in turns])
+    return [seen(points, colours, pose, k + 1) for k, pose in enumerate(poses)], poses
+
+
+@pytest.fixture(scope="module")
+def bottles():
+    views, poses = pile(*bottle(), 7, 3)
+    crops = crops_of(views)
+    body = fit_revolution(views, crops)
+    return views, crops, poses, body, seats_of(crops, body)
+
+
+def off_axis(pose: np.ndarray, truth: np.ndarray, sign: float) -> float:
+    return float(np.degrees(np.arccos(np.clip(sign * axis_of(pose) @ axis_of(truth), -1, 1))))
+
+
+def test_outlines_tell_the_axes(bottles):
+    _, _, poses, body, seats = bottles
+    assert body.misfit < EXACT
+    off = min(([min(off_axis(p, t, sign) for p in some) for some, t in zip(seats, poses, strict=True)] for sign in (1, -1)), key=sum)
+    assert np.median(off) < 4 and max(off) < 12, off
+    assert np.median([len(some) for some in seats]) <= 2
+
+
+def test_decoration_tells_the_turns_about_them(bottles):
+    views, _, poses, body, seats = bottles
+    told = turned_by_decoration(views, body.profile, seats)["colour and brightness"]
+    turn = [t[:3, :3] @ p[:3, :3].T for p, t in zip(told.poses, poses, strict=True)]  # one for all, if they are right
+    off = np.array([[rotation_angle(a.T @ b) for a in turn] for b in turn])
+    off = off[np.median(off, 1).argmin()]
+    assert (off < 12).sum() >= 5, off
+    assert (off[told.leads >= CLEAR] < 20).all(), (off, told.leads)  # those that say that they are sure are right
+    assert (told.leads >= CLEAR).sum() >= 4, told.leads
+
+
+def test_a_pose_that_is_off_comes_back_to_its_outline(bottles):
+    _, crops, _, body, _ = bottles
+    for crop, pose in zip(crops[:4], body.poses, strict=False):
+        outline, tilted = outline_of(crop), pose.copy()
+        tilt = Rotation.from_rotvec(np.radians([0.0, 0.0, 6.0])).as_matrix()
+        tilted[:3] = np.concatenate([tilt @ pose[:3, :3], (tilt @ pose[:3, 3:])], 1)
+        before = float(((outline.weights(r := outline.residual(body.profile, tilted)) * r) ** 2).sum())
+        back, level = adjusted_pose(outline, body.profile, tilted)
+        assert level < 0.3 * before
+        assert np.degrees(np.arccos(axis_of(back) @ axis_of(pose))) < 5  # shortening by a tilt is nearly that by distance
+
+
+def test_an_axis_that_leans_the_other_way_has_nearly_the_same_outline(bottles):
+    *_, body, _ = bottles
+    turn = Rotation.random(random_state=4).as_matrix()
+    pose = similarity(turn, turn @ np.array([0, 0, -150.0]))
+    other, again = leaning_back(pose), leaning_back(leaning_back(pose))
+    assert np.allclose(axis_of(again), axis_of(pose), atol=1e-9)
+    assert np.isclose(axis_of(other)[2], -axis_of(pose)[2], atol=1e-9) and abs(axis_of(pose)[2]) > 0.2
+    a, b = (drawn(body.profile, Camera(SIDE, SIDE, 6000.0, 6000.0, SIDE / 2, SIDE / 2, p)) > 0.5 for p in (pose, other))
+    assert a.sum() > 500 and (a ^ b).sum() < 0.03 * a.sum()
+
+
+@pytest.mark.parametrize("radii", [(0.8, 0.55, 0.3), (0.7, 0.7, 0.7)], ids=["lopsided", "ball"])
+def test_what_has_no_axis_is_not_sure_of_it(radii):
+    """Ellipses are the outlines of a body of revolution too: what is not sure of its turns is left to the search."""
+    views, _ = pile(*ellipsoid(*radii), 4, 1)
+    found = place_revolved(views, crops_of(views), OPTIONS)
+    assert found is None or len(found.unsure) > len(views) / 2
+
+
+def test_two_maps_of_one_decoration_are_laid_on_each_other():
+    rng = np.random.default_rng(2)
+    values = gaussian_filter(rng.standard_normal((1, LATITUDES, TURNS)), (0, 1.5, 2), mode="wrap")
+    values /= values.std()
+    shown = np.ones((LATITUDES, TURNS), bool)
+    shown[:, 70:] = False
+    board = Board(np.zeros(LATITUDES * TURNS), np.zeros(LATITUDES * TURNS))
+    board.lay(cells_of(shown, values), 0)
+    before = board.total.copy()
+    gains = board.gains(cells_of(np.roll(shown, -17, 1), np.roll(values, -17, 2)))
+    assert gains.argmax() == 17 and gains.max() > 3 * np.sort(gains)[-12]
+    board.lay(cells_of(shown, values), 31)
+    board.lay(cells_of(shown, values), 31, -1)
+    assert np.allclose(board.total, before)
+
+
+def test_a_turn_about_the_axis_leaves_the_axis(bottles):
+    pose = bottles[3].poses[0]
+    turned = turned_about(pose, 0.7)
+    assert np.allclose(axis_of(turned), axis_of(pose)) and np.isclose(rotation_angle(turned[:3, :3] @ pose[:3, :3].T), np.degrees(0.7))
+
+
+def placed(bottles, monkeypatch, leads):
+    """(what the search finds, what it has said), of bottles whose decoration tells with these leads."""
+    views, _, _, body, seats = bottles
+    said: list[str] = []
+    told = turned_by_decoration(views, body.profile, seats)["colour and brightness"]
+    monkeypatch.setattr("relit.fit.instance_revolution.fit_revolution", lambda *a: body)
+    monkeypatch.setattr("relit.fit.instance_revolution.seats_of", lambda *a: seats)
+    monkeypatch.setattr("relit.fit.instance_revolution.turned_by_decoration", lambda *a: {"colour": Told(told.poses, leads)})
+    monkeypatch.setattr(instance_search, "settled", lambda views, crops, rings, poses, scores, o, **_: (poses, scores))
+    found = instance_search.place(views, OPTIONS, say=said.append)
+    off = min(([off_axis(p, t, sign) for p, t in zip(found.poses, bottles[2], strict=True)] for sign in (1, -1)), key=sum)
+    assert np.median(off) < 6, off
+    return found, said
+
+
+def test_bodies_of_revolution_that_are_sure_are_not_searched(bottles, monkeypatch):
+    monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses"))
+    found, _ = placed(bottles, monkeypatch, np.full(7, 1.0))
+    assert found.sure
+
+
+def test_bodies_of_revolution_that_are_not_sure_keep_their_axes_where_the_search_finds_nothing(bottles, monkeypatch):
+    asked = []
+    monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: asked.append(1) or {})
+    _, said = placed(bottles, monkeypatch, np.zeros(7))
+    assert asked and any("7 of 7 are not sure" in text for text in said)
