@@ -1,5 +1,6 @@
 """The search for poses of identical objects: guesses for pairs, growth from the best of them, rounds of fit and search.
 
+place_revolved bodies of revolution, by their outlines and their decoration (fit/instance_revolution.py); all others go on as follows
 pair_guesses   every instance's silhouette is inflated to a crude model, and every other one registered against it (fit/instance_guesses.py)
 grow           one instance after another joins those that stand already (fit/instance_growth.py); from several pairs, the best counts
 improved       where instances were not sure of their places: taken out and grown again, another way each time (fit/instance_regrowth.py)
@@ -89,7 +90,8 @@ def turned(views, crops, revolved: Placed, o: Search, *, seed: int, links=(), sa
 
 
 def only_axes(revolved: Placed, say) -> Found:
-    say(f"note: {len(revolved.unsure)} of {len(revolved.own)} are not sure of their turn about the axis: their decoration may be mixed")
+    if revolved.unsure:
+        say(f"note: {len(revolved.unsure)} of {len(revolved.own)} are not sure of their turn about the axis: their decoration may be mixed")
     return Found(revolved.poses, revolved.own, True)
 
 

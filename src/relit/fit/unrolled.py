@@ -35,7 +35,8 @@ SWEEPS = 4  # in which each is laid again
 
 @dataclass(frozen=True)
 class Cells:
-    """What a view in a seat shows of the map, in one channel. at: (TURNS, C) flat indices of its cells for every shift. values: (C,)."""
+    """What a view in a seat shows of the map, in the channels that are asked. at: (TURNS, C) flat indices of its cells for every shift.
+    values, weights: (C,), what was read there, and what it counts: a cell near the ends is small."""
 
     at: np.ndarray
     values: np.ndarray
