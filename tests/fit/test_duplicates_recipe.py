@@ -214,7 +214,7 @@ def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
         return np.arange(bank.views) == 2
 
     monkeypatch.setattr(shape, "odd_instances", third)
-    monkeypatch.setattr(shape, "sought_again", lambda *_: None)
+    monkeypatch.setattr(shape, "sought_again", lambda *_: (None, False))
     capture, options = open_capture(pile), small_options(level_steps=(12,))
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(capture, run, options, 0)

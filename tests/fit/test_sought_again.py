@@ -6,14 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from volume_lump import photos_of, volume_lump
 
 from relit.cameras.se3 import rotation_angle
+from relit.conventions import similarity
 from relit.fit import sought_again as module
+from relit.fit.duplicates_shape import carried
 from relit.fit.instances import View, pixel_bank
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import volume_render
 from relit.fit.sought_again import sought_again
+from relit.fit.turns import turned_about
 from relit.rendering.shade_world import shade_world, start_world_light
 
 
@@ -39,11 +43,12 @@ def test_it_is_found_though_half_of_it_is_hidden_and_it_stands_in_the_shade(lump
     monkeypatch.setattr(module, "STEPS", 120)
     before = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
     level = float(view_errors(pixel_bank([hidden], poses[:1]), model)[0]) / 80  # a tenth of what it is at a wrong place agrees
-    found = sought_again(hidden, guide, poses[0], model, level, None)
+    found, certain = sought_again(hidden, guide, poses[0], model, level, None)
+    assert certain
     assert rotation_angle(found[:3, :3].T @ poses[1][:3, :3]) < 1.5
     assert np.linalg.norm(found[:3, 3] - poses[1][:3, 3]) < 0.1
     mirrored = replace(hidden, rgb=hidden.rgb[:, ::-1], mask=hidden.mask[:, ::-1], known=hidden.known[:, ::-1])
-    assert sought_again(mirrored, guide, poses[0], model, level, None) is None
+    assert sought_again(mirrored, guide, poses[0], model, level, None) == (None, False)
     after = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))  # the model itself stays
 
@@ -55,7 +60,7 @@ def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
     monkeypatch.setattr(module, "candidates", lambda *_: turned)
     for errors, out in (([1.0, 1.5], True), ([1.0, 3.0], False), ([9.0, 30.0], True)):
         monkeypatch.setattr(module, "descended", lambda *_, e=errors: (turned, np.array(e)))
-        assert (sought_again(hidden, guide, poses[0], model, 1.0, None) is None) == out
+        assert (sought_again(hidden, guide, poses[0], model, 1.0, None)[0] is None) == out
 
 
 def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
@@ -70,8 +75,29 @@ def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
             return poses[[1, 0]], np.array(errors_of_turn[len(asked) - 1])
 
         monkeypatch.setattr(module, "descended", descended)
-        return sought_again(hidden, guide, poses[0], None, 1.0, None, 5)
+        return sought_again(hidden, guide, poses[0], None, 1.0, None, 5)[0]
 
     monkeypatch.setattr(module, "candidates", lambda *_: poses[[1, 0]])
     assert np.array_equal(found([[20.0, 30.0], [3.0, 30.0]]), poses[1]) and asked == [5, 6]
     assert found([[20.0, 30.0]] * 3) is None and asked == [5, 6, 7]
+
+
+def test_of_one_whose_axis_is_known_all_turns_are_tried_and_the_best_is_taken(lump, monkeypatch):
+    model, (guide, hidden), poses = lump
+    monkeypatch.setattr(module, "STEPS", 60)
+    level = float(view_errors(pixel_bank([hidden], poses[:1]), model)[0]) / 40
+    turned = turned_about(poses[1], 2.0)
+    assert rotation_angle(turned[:3, :3].T @ poses[1][:3, :3]) > 100
+    found, certain = sought_again(hidden, guide, poses[0], model, level, None, on_axis=turned)
+    assert certain and rotation_angle(found[:3, :3].T @ poses[1][:3, :3]) < 6
+    found, certain = sought_again(hidden, guide, poses[0], model, 1e-9 * level, None, on_axis=turned)  # nothing agrees: a guess
+    assert not certain and found is not None
+
+
+def test_poses_are_carried_along_with_those_that_passes_have_moved():
+    rng = np.random.default_rng(0)
+    before = np.array([similarity(r, rng.standard_normal(3)) for r in Rotation.random(6, random_state=1).as_matrix()])
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    after = np.array([similarity(turn @ p[:3, :3], 1.2 * turn @ p[:3, 3] + [0.1, 0.2, -0.3]) for p in before])
+    there = carried({7: before[5]}, before[:5], after[:5])
+    assert np.allclose(there[7], after[5])

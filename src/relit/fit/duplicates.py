@@ -67,14 +67,15 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
         run.say(f"note: one object in {len(photos)} photos: it is placed by search; from all around --capture multiview is more exact")
     if "normals" in options.without and not options.normal_network and all(pixels.normal is None for pixels, _ in shots):
         run.say("note: without=normals changes nothing: no photo has normal priors")
-    poses, registered, keys, unsure = poses_stage(shots, run, options, seed)
+    poses, registered, keys, unsure, axes = poses_stage(shots, run, options, seed)
+    on_axes = {int(k): p for k, p, one in zip(keys, poses, axes, strict=True) if one}
     shown = [v for v in all_views(shots, options.side, options) if v.key in keys]
     views, others = ([v for v in shown if (v.key in keys[registered]) == placed] for placed in (True, False))
     poses = poses[registered]
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
     else:
-        parts = shape_stages(views, poses, others, run, options, seed)
+        parts = shape_stages(views, poses, others, on_axes, run, options, seed)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     camera = photos[0].camera
     maps = run_arrays(run, "surface", "maps") if run.done("surface") else surface_stage(shots, camera, mesh, parts, run, options, seed)
@@ -129,6 +130,8 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         used, cameras = [shots[n][0] for n in numbers], [shots[n][1].with_pose(scene_from_photo @ parts["motions"][n]) for n in numbers]
         keys = parts["view_keys"]
         shown = [keys // ANOTHER_PHOTO == n for n in numbers]
+        told = ~np.isin(keys, parts.get("vague", ()))  # what is turned by guess shows nothing at its place
+        shown = [own & told for own in shown]
         labels = [(keys[own] % ANOTHER_PHOTO).tolist() for own in shown]
         if moves is None:
             bank = photo_bank(used, cameras, [set(some) for some in labels], options.max_pixels)
@@ -203,6 +206,8 @@ def assemble(photos, mesh: Mesh, maps, parts, keys: dict[int, float]) -> Asset:
     for key, other in keys.items():
         if key in placed_keys:
             doubt = f"ambiguous: turned by {other:.0f} degrees it agrees about as well" if other else ""
+            if key in parts.get("vague", ()):
+                doubt = "ambiguous: its turn about the axis of the object is a guess"
             instances.append(Instance(key, world_from_object[placed_keys.index(key)], doubt))
         elif key not in shown and (key < ANOTHER_PHOTO or parts["related"][key // ANOTHER_PHOTO]):
             instances.append(Instance(key, None, "it agrees too little with the model of the others"))

@@ -17,6 +17,7 @@ from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instance_growth import seen_from
 from relit.fit.instance_options import Search
 from relit.fit.instance_rounds import ambiguous
+from relit.fit.instance_search import LEFT_OUT
 from relit.fit.instance_trials import place_few
 from relit.fit.instances import COARSE, View, carved, views_of
 from relit.geometry.hull import NoShape
@@ -39,12 +40,12 @@ def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[
 
 
 def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
-    """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,), unsure (N,) degrees) of all views, in the unit frame of the
-    object. unsure: see `instance_rounds.ambiguous`."""
+    """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,), unsure (N,) degrees, axes (N,) bool) of all views, in the unit
+    frame of the object. unsure: see `instance_rounds.ambiguous`. axes: not registered, but right up to a turn about the object's y axis."""
     if run.done("poses"):
         saved = run_arrays(run, "poses", "poses")
-        unsure = saved.get("unsure", np.zeros(len(saved["labels"])))
-        return saved["poses"], saved["registered"], saved["labels"], unsure
+        none = np.zeros(len(saved["labels"]))
+        return saved["poses"], saved["registered"], saved["labels"], saved.get("unsure", none), saved.get("axes", none > 0)
     views = all_views(shots, COARSE, options)
     with run.stage("poses", title="poses of the instances") as stage:
         matched = None if "matching" in options.without else match_instances(shots, run, options, seed)
@@ -64,7 +65,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
             registered &= linked_together(len(views), matched.told if matched else ())
         if registered.sum() < min(2, len(views)):
             raise UserError("hardly any instance could be placed", "see the scores in the log", "check the label image", code=EXIT_FAILED)
-        for k in np.flatnonzero(~registered):
+        for k in np.flatnonzero(~registered & (scores > LEFT_OUT)):
             run.say(f"note: the object with {named(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only")
         unsure = np.zeros(len(views))
         if registered.sum() > 2 and "refinement" not in options.without:
@@ -75,8 +76,9 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
             poses = adjusted_poses(matched, poses, registered, run)
         poses = centred(views, poses, registered)
         keys = np.array([v.key for v in views])
-        stage.save("poses", poses=poses, registered=registered, labels=keys, scores=scores, unsure=unsure)
-    return poses, registered, keys, unsure
+        axes = scores == LEFT_OUT
+        stage.save("poses", poses=poses, registered=registered, labels=keys, scores=scores, unsure=unsure, axes=axes)
+    return poses, registered, keys, unsure, axes
 
 
 def linked_together(count: int, told: tuple) -> np.ndarray:

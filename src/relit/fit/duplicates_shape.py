@@ -9,7 +9,8 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
-from relit.cameras.se3 import rotation_angle, turns_apart
+from relit.cameras.se3 import nearest_rotation, rotation_angle, turns_apart
+from relit.conventions import similarity
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import named
@@ -38,19 +39,22 @@ ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last o
 
 
 def shape_stages(
-    views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int
+    views: list[View], poses: np.ndarray, others: list[View], on_axes: dict[int, np.ndarray], run, options: DuplicatesOptions, seed: int
 ) -> dict[str, np.ndarray]:
-    """Volume pass, mesh, ground. others: views without poses. Returns (and keeps) vertices, faces, normals, uvs, base (V, 3), plane (point,
+    """Volume pass, mesh, ground. others: views without poses; on_axes: by key, poses of such as are right up to a turn about the object's y
+    axis. Returns (and keeps) vertices, faces, normals, uvs, base (V, 3), plane (point,
     normal) or empty; for each instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view);
     motions (P, 4, 4) first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances
-    (N,) which of the instances it is."""
-    views, poses, model, arrived = volume_stage(views, poses, others, run, options, seed)
+    (N,) which of the instances it is; vague, keys of those whose turn about the axis is a guess."""
+    views, poses, model, arrived, vague = volume_stage(views, poses, others, on_axes, run, options, seed)
     rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
         if rate > 0 and not arrived:  # else outlines and textures have had their say before the last pass
             mesh, poses, _ = followed(mesh, views, poses, run, options)
+        if vague:
+            views, poses = [*views, *(v for v, _ in vague)], np.concatenate([poses, *(p[None] for _, p in vague)])
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
@@ -86,6 +90,7 @@ def shape_stages(
             "motions": np.array([motion_or_none(m) for m in scene.motions]),
             "related": np.array([m is not None for m in scene.motions]),
             "plane": plane,
+            "vague": np.array([v.key for v, _ in vague], int),
         }
         stage.save("mesh", **parts)
     return parts
@@ -149,10 +154,14 @@ def joint_stage(
     return poses, odd, disagree, turn, symmetry
 
 
-def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, options: DuplicatesOptions, seed: int):
-    """(views, poses, model, arrived: see `joint_stages`) after the volume pass, from the poses of the first ones. Instances that do not
-    agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished model."""
-    arrived, symmetry = False, None
+def volume_stage(
+    views: list[View], poses: np.ndarray, others: list[View], on_axes: dict[int, np.ndarray], run, options: DuplicatesOptions, seed: int
+):
+    """(views, poses, model, arrived: see `joint_stages`, vague) after the volume pass, from the poses of the first ones. Instances that do
+    not agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished model.
+    vague: (view, pose) of those of `on_axes` (see `shape_stages`) that are not sure of their turn there either."""
+    arrived, symmetry, vague = False, None, []
+    before = {v.key: p for v, p in zip(views, poses, strict=True)}
     if pose_rate(views, options) > 0:
         poses, odd, arrived, symmetry = joint_stages(views, poses, run, options, seed)
         others = [*others, *(views[k] for k in np.flatnonzero(odd))]
@@ -160,22 +169,37 @@ def volume_stage(views: list[View], poses: np.ndarray, others: list[View], run, 
     with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still=arrived)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
-            views, poses = with_found(views, poses, others, model, bank, run, seed)
-        return views, poses, model, arrived
+            on_axes = carried(on_axes, np.array([before[v.key] for v in views]), poses)
+            views, poses, vague = with_found(views, poses, others, on_axes, model, bank, run, seed)
+        return views, poses, model, arrived, vague
 
 
-def with_found(views: list[View], poses: np.ndarray, others: list[View], model: VolumeModel, bank: PixelBank, run, seed: int):
-    """The views and their poses, and those of `others` that are found in the model, which gets their entries."""
+def carried(some: dict[int, np.ndarray], before: np.ndarray, after: np.ndarray) -> dict[int, np.ndarray]:
+    """Poses of the object's frame before passes that have moved it, in that after them: by the similarity that those (N, 4, 4) tell which
+    have gone along."""
+    turn = nearest_rotation(np.sum(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1), 0))
+    far = [np.linalg.norm(p[:, :3, 3] - p[:, :3, 3].mean(0), axis=1).mean() for p in (before, after)]
+    scale = far[1] / far[0] if len(before) > 1 and far[0] > 0 else 1.0
+    shift = np.median(after[:, :3, 3] - scale * before[:, :3, 3] @ turn.T, axis=0)
+    return {k: similarity(turn @ p[:3, :3], scale * turn @ p[:3, 3] + shift) for k, p in some.items()}
+
+
+def with_found(
+    views: list[View], poses: np.ndarray, others: list[View], on_axes: dict[int, np.ndarray], model: VolumeModel, bank: PixelBank, run, seed
+):
+    """(views, poses, vague: see `volume_stage`) with those of `others` that are found in the model, which gets their entries."""
     level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
-    found = []
+    found, vague = [], []
     for view in others:
-        pose = sought_again(view, views[0], poses[0], model, level, turns, seed)
-        run.say(f"the object with {named(view)} was {'' if pose is not None else 'not '}found in the finished model of the others")
+        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key))
+        where = "" if sure else "by its axis alone " if pose is not None else "not "
+        run.say(f"the object with {named(view)} was {where}found in the finished model of the others")
         if pose is not None:
-            found.append((view, pose))
-    model.reflections = mi.Float(np.concatenate([np.array(model.reflections), np.zeros(4 * len(found), np.float32)]))
-    return [*views, *(v for v, _ in found)], np.concatenate([poses, *(p[None] for _, p in found)])
+            (found if sure else vague).append((view, pose))
+    count = len(found) + len(vague)
+    model.reflections = mi.Float(np.concatenate([np.array(model.reflections), np.zeros(4 * count, np.float32)]))
+    return [*views, *(v for v, _ in found)], np.concatenate([poses, *(p[None] for _, p in found)]), vague
 
 
 def pose_rate(views: list[View], options: DuplicatesOptions) -> float:

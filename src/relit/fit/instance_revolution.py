@@ -1,55 +1,81 @@
-"""The search for poses of identical objects that are bodies of revolution: bottles, cans, vases.
+"""The search for poses of identical objects that are bodies of revolution, or nearly: bottles, cans, vases, cups.
 
-Their silhouettes tell where the axis of each points (fit/revolution.py), their decoration the turn about it (fit/unrolled.py). Of several
-answers a model of all says which holds. Where most are sure of their turns, the others are asked as growth asks them
-(`instance_regrowth.confirmed`); where they are not, the axes are still right, and with them the shape.
+Their silhouettes tell where the axis of each points (fit/revolution_fit.py), what sticks out of them (fit/beside.py) or their decoration
+(fit/unrolled.py) the turn about it. Of several answers a model of all says which holds. Those who are not sure of their turns are asked as
+growth asks them (`instance_regrowth.confirmed`); where that tells nothing, the axes are still right, and with them the shape.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from relit.fit.beside import turned_by_outline
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import Placed
 from relit.fit.instance_rounds import model_of_all
 from relit.fit.instances import View, albedo_render, carved, fit_model
 from relit.fit.register import Crop, crop_rings, refine
-from relit.fit.revolution import fit_revolution, seats_of
+from relit.fit.revolution_fit import fit_revolution, seats_of
 from relit.fit.unrolled import turned_by_decoration
 from relit.geometry.hull import NoShape
 
 FEWEST = 4  # objects: of fewer, silhouettes that something else has can be those of a body of revolution
 LIKELY = 0.96  # score of the best silhouette, revolved, against all others, below which nothing is fitted
-NEARLY, EXACT = 0.004, 0.001  # misfit (`revolution.misfit`) of a first fit, and of a body of revolution
+FIRST, NEARLY, EXACT = 0.01, 0.004, 0.001  # misfit (`Revolved.misfit`) of a first fit, of a body with a handle, and of one without
 OPEN = 5  # seats of the median object, from which on the silhouettes do not tell the axis: those of a ball
 DECORATION = (0.0, 2.0, 0.0, 1.0)  # weights of fit.register's descriptor: silhouettes agree in every turn
-CLEAR = 0.3  # `unrolled.Told.leads` of an object that is sure of its turn
+LAID, FLAT = 6, 0.4  # objects from which on a plane tells, and how far from it (root mean square, unit lengths) their middles may lie
 
 
-def place_revolved(views: list[View], crops: list[Crop], o: Search, *, seed: int = 0, say=lambda text: None) -> Placed | None:
+@dataclass(frozen=True)
+class RevolvedPlaces:
+    """What outlines and maps tell. placed: where all stand. axes: their outlines are those of a body of revolution, so that the axes hold
+    whatever the turns. certain: nothing else has these outlines where it is: a triaxial ellipsoid has them, if from other distances, so
+    most have to be sure of their turn, or all to lie on one plane. What has a handle is certain where most are sure."""
+
+    placed: Placed
+    axes: bool
+    certain: bool
+
+
+def place_revolved(views: list[View], crops: list[Crop], o: Search, *, seed: int = 0, say=lambda text: None) -> RevolvedPlaces | None:
     """Where bodies of revolution stand, and which are not sure of their turn about the axis; None where the objects are none, or their
     silhouettes do not tell the axis."""
     if len(views) < FEWEST:
         return None
-    body = fit_revolution(views, crops, LIKELY, NEARLY)
-    if body is None or body.misfit > EXACT:
+    body = fit_revolution(views, crops, LIKELY, FIRST)
+    if body is None or body.misfit > NEARLY:
         return None
     seats = seats_of(crops, body)
-    if np.median([len(some) for some in seats]) >= OPEN:
+    exact = body.misfit <= EXACT
+    if exact and np.median([len(some) for some in seats]) >= OPEN:
         return None
+    answers = turned_by_decoration(views, body.profile, seats) if exact else {}
+    beside = turned_by_outline(views, body.profile, np.array([some[0] for some in seats]))
+    if beside is not None:
+        answers["what sticks out"] = beside
+    levels = {name: decoration_agreement(views, crops, answer.poses, o, seed) for name, answer in answers.items()}
+    if max(levels.values(), default=-np.inf) == -np.inf:
+        return None
+    told = max(levels, key=levels.get)
+    poses, sure = answers[told].poses, answers[told].sure
     say(f"bodies of revolution: one profile fits the outlines (misfit {body.misfit:.5f} of a silhouette's area)")
-    best, height, told = None, -np.inf, ""
-    for channel, answer in turned_by_decoration(views, body.profile, seats).items():
-        level = decoration_agreement(views, crops, answer.poses, o, seed)
-        if level > height:
-            best, height, told = answer, level, channel
-    if best is None:
-        return None
-    unsure = np.flatnonzero(best.leads < CLEAR).tolist()
-    say(f"turned about their axes by {told}: {len(views) - len(unsure)} of {len(views)} are sure")
-    own = model_of_all(views, best.poses, o, seed=seed)[1]
-    sure = tuple(k for k in range(len(views)) if k not in unsure)
-    return Placed(best.poses, own, sure, tuple(unsure), DETAILED)
+    say(f"turned about their axes by {told}: {sure.sum()} of {len(views)} are sure")
+    own = model_of_all(views, poses, o, seed=seed)[1]
+    placed = Placed(poses, own, tuple(np.flatnonzero(sure).tolist()), tuple(np.flatnonzero(~sure).tolist()), DETAILED)
+    return RevolvedPlaces(placed, exact, mostly_sure(placed) or (exact and flat(poses)))
+
+
+def mostly_sure(placed: Placed) -> bool:
+    return len(placed.firm) >= max(FEWEST, len(placed.own) / 2)
+
+
+def flat(poses: np.ndarray) -> bool:
+    """Whether the middles of LAID objects or more lie on one plane."""
+    middles = np.array([-p[:3, :3].T @ p[:3, 3] for p in poses])
+    return len(poses) >= LAID and np.linalg.svd(middles - middles.mean(0))[1][2] <= FLAT * np.sqrt(len(poses))
 
 
 def decoration_agreement(views, crops, poses: np.ndarray, o: Search, seed: int) -> float:

@@ -19,20 +19,22 @@ from relit.fit.instance_guesses import Guesses, first_pairs, pair_guesses
 from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged
-from relit.fit.instance_revolution import place_revolved
+from relit.fit.instance_revolution import mostly_sure, place_revolved
 from relit.fit.instance_rounds import settled
-from relit.fit.instances import View, crops_of, first_pose, frame_scale
+from relit.fit.instances import View, best_seen, crops_of, first_pose, frame_scale
 from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
 
 ALIKE = 15.0  # degrees within which links tell the same turn
+LEFT_OUT = -1.0  # score of an instance whose place is not known
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances. sure: nearly all of them were sure of
-    their places and agree about as well as the others (`instance_regrowth.believed`), or another search would find the same."""
+    """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances, LEFT_OUT where the place is not known.
+    sure: nearly all of them were sure of their places and agree about as well as the others (`instance_regrowth.believed`), or another
+    search would find the same."""
 
     poses: np.ndarray
     scores: np.ndarray
@@ -79,20 +81,16 @@ def linked_sets(views, links, distance: float) -> list[Branch]:
     return sorted(sets, key=lambda one: -len(one[0]))
 
 
-def turned(views, crops, revolved: Placed, o: Search, *, seed: int, links=(), say=lambda text: None) -> Found:
-    """Bodies of revolution, of which some are not sure of their turn about the axis: they are asked as growth asks them. Where that is not
-    believed they stay as decoration tells them; a search over all poses would lose the axes."""
-    again = confirmed(views, crops, crop_rings(crops, DETAILED), revolved, o, seed=seed, links=links)
-    if believed(again, o):
-        poses, scores = settled(views, crops, crop_rings(crops, DETAILED), again.poses, again.own, o, seed=seed, say=say)
-        return Found(poses, scores, True)
-    return only_axes(revolved, say)
-
-
-def only_axes(revolved: Placed, say) -> Found:
-    if revolved.unsure:
-        say(f"note: {len(revolved.unsure)} of {len(revolved.own)} are not sure of their turn about the axis: their decoration may be mixed")
-    return Found(revolved.poses, revolved.own, True)
+def by_axes(revolved: Placed, say) -> Found:
+    """Bodies of revolution as outlines and decoration have them, of which some are not sure of their turn: a search over all poses would
+    lose the axes. Where most are sure the others are left out (score -1), to be sought in the finished model of these."""
+    scores, unsure = revolved.own.copy(), list(revolved.unsure)
+    if unsure and mostly_sure(revolved):
+        scores[unsure] = LEFT_OUT
+        say(f"note: {len(unsure)} of {len(scores)} are not sure of their turn about the axis: they are left to the end")
+    elif unsure:
+        say(f"note: {len(unsure)} of {len(scores)} are not sure of their turn about the axis: their decoration may be mixed")
+    return Found(revolved.poses, scores, True)
 
 
 def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None, step=lambda done, total: None) -> Found:
@@ -101,19 +99,46 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     links: ((i, j, rotation of i onto j in the photo), ...) from matching: growth tries them beside its own guesses. Raises NoShape where
     no set of poses agrees with the silhouettes.
     """
-    distance = frame_scale(views)
     if len(views) == 1:
-        return Found(first_pose(views[0], distance)[None], np.ones(1), True)
+        return Found(first_pose(views[0], frame_scale(views))[None], np.ones(1), True)
     crops = crops_of(views)
+    best: Placed | None = None
     revolved = place_revolved(views, crops, o, seed=seed, say=say)
-    if revolved is not None and 2 * len(revolved.unsure) <= len(views):
-        return turned(views, crops, revolved, o, seed=seed, links=links, say=say)
-    order = sorted(range(len(views)), key=lambda k: -views[k].seen * np.sqrt(views[k].mask.sum()) / views[k].camera.fx)
-    chosen = order[: o.models]
-    guesses = pair_guesses(views, crops, chosen, o, distance, seed, step)
+    if revolved is not None:
+        best = confirmed(views, crops, crop_rings(crops, DETAILED), revolved.placed, o, seed=seed, links=links)
+        if revolved.certain and not believed(best, o):
+            return by_axes(revolved.placed, say)
+    if not believed(best, o):
+        best = grown_from_pairs(views, crops, None if revolved and revolved.axes else best, o, seed=seed, links=links, say=say, step=step)
+        if revolved is not None and revolved.axes and not believed(best, o):
+            return by_axes(revolved.placed, say)
+    if best is None:
+        raise NoShape("no set of poses agrees with the silhouettes")
+    if not believed(best, o) and len(views) > 3:
+        best = improved(views, crops, crop_rings(crops, DETAILED), best, o, seed=seed + 60, links=links, say=say)
+    if not believed(best, o):
+        doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
+        say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
+    poses, scores = settled(views, crops, crop_rings(crops, best.parts), best.poses, best.own, o, seed=seed, parts=best.parts, say=say)
+    return Found(poses, scores, believed(best, o))
+
+
+def grown_from_pairs(
+    views: list[View],
+    crops,
+    best: Placed | None,
+    o: Search,
+    *,
+    seed: int = 0,
+    links=(),
+    say=lambda text: None,
+    step=lambda done, total: None,
+) -> Placed | None:
+    """What growth makes of pairs, as far as it is better than `best`; None where nothing agrees with the silhouettes."""
+    chosen = best_seen(views)[: o.models]
+    guesses = pair_guesses(views, crops, chosen, o, frame_scale(views), seed, step)
     rings = {parts: crop_rings(crops, parts) for parts in guesses}
     starts = {parts: first_starts(views, crops, rings[parts], parts, some, chosen, links, o, seed) for parts, some in guesses.items()}
-    best: Placed | None = None
     for turn in range(o.starts):
         for parts in starts:
             if turn >= len(starts[parts]) or believed(best, o):
@@ -133,14 +158,4 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
             )
             if best is None or believed(placed, o) or placed.agreement > best.agreement:
                 best = placed
-    if revolved is not None and not believed(best, o):
-        return only_axes(revolved, say)
-    if best is None:
-        raise NoShape("no set of poses agrees with the silhouettes")
-    if not believed(best, o) and len(views) > 3:
-        best = improved(views, crops, rings[DETAILED], best, o, seed=seed + 60, links=links, say=say)
-    if not believed(best, o):
-        doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
-        say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
-    poses, scores = settled(views, crops, rings[best.parts], best.poses, best.own, o, seed=seed, parts=best.parts, say=say)
-    return Found(poses, scores, believed(best, o))
+    return best

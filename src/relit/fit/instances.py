@@ -95,6 +95,11 @@ def crops_of(views: list[View]) -> list[Crop]:
     return [crop_photo(v.rgb, v.mask, v.camera.with_pose(np.eye(4)), v.known) for v in views]
 
 
+def best_seen(views: list[View]) -> list[int]:
+    """Indices of the views, those first whose outline ends at known background and which are large."""
+    return sorted(range(len(views)), key=lambda k: -views[k].seen * np.sqrt(views[k].mask.sum()) / views[k].camera.fx)
+
+
 def window(a: np.ndarray, top: int, left: int, h: int, w: int) -> np.ndarray:
     """(h, w, ...) of a picture, 0 beyond its border."""
     rows, columns = np.clip([top, top + h], 0, a.shape[0]), np.clip([left, left + w], 0, a.shape[1])

@@ -22,6 +22,7 @@ from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from
+from relit.fit.turns import turned_about
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
 
@@ -31,28 +32,47 @@ TRIES = 12  # places of an instance that are tried, half of them under each desc
 APART = 12.0
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
+TURNS = 24  # about an axis that is known
 ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
 
 
-def sought_again(view: View, guide: View, guide_pose: np.ndarray, model: VolumeModel, level: float, turns: Callable | None, seed: int = 0):
-    """The pose (4, 4) of `view` in the model, or None where what it shows agrees with the model nowhere, or in several places.
+def sought_again(
+    view: View,
+    guide: View,
+    guide_pose: np.ndarray,
+    model: VolumeModel,
+    level: float,
+    turns: Callable | None,
+    seed: int = 0,
+    on_axis: np.ndarray | None = None,
+):
+    """(pose (4, 4) of `view` in the model or None, is that certain): None where what it shows agrees with the model nowhere, or in several
+    places.
 
     guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
-    `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo.
+    `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
+    about the object's y axis: all turns are tried, and the best is taken, certain or not.
     """
     distance = float(np.linalg.norm(guide_pose[:3, 3]))
-    for turn in range(ROUNDS):
-        poses = candidates(view, model, distance, seed + turn)
+    for turn in range(ROUNDS if on_axis is None else 1):
+        poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis)
         if len(poses) == 0:
             continue
         poses, errors = descended(view, guide, guide_pose, poses, model, turns, seed + turn)
         best = int(np.nanargmin(errors))
-        if errors[best] > AGREES * level:
-            continue
         elsewhere = [e for p, e in zip(poses, errors, strict=True) if rotation_angle(p[:3, :3].T @ poses[best][:3, :3]) > ANOTHER]
-        return poses[best] if all(e >= CLEARLY * errors[best] for e in elsewhere) else None
-    return None
+        certain = errors[best] <= AGREES * level and all(e >= CLEARLY * errors[best] for e in elsewhere)
+        if certain or on_axis is not None:
+            return poses[best], certain
+        if errors[best] <= AGREES * level:
+            break
+    return None, False
+
+
+def all_turns(pose: np.ndarray) -> np.ndarray:
+    """(TURNS, 4, 4): the pose with the object turned about its axis."""
+    return np.array([turned_about(pose, a) for a in np.arange(TURNS) * 2 * np.pi / TURNS])
 
 
 def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:

@@ -1,8 +1,8 @@
 """The turn of identical bodies of revolution about their axes, from their decoration.
 
 The pixels of each are unrolled onto the body: latitude about its middle, and turn about its axis. Two pictures of one decoration then
-differ by a shift. All shifts are sought together, with the seats of each (fit/revolution.py): for every cell of the map the evidence that
-what was seen there are noisy readings of one value, against readings that have nothing in common (marginal likelihood of a Gaussian).
+differ by a shift (fit/turns.py): for every cell of the map the evidence that what was seen there are noisy readings of one value, against
+readings that have nothing in common (marginal likelihood of a Gaussian).
 
 What shading leaves in the maps can be laid on top of each other as well, and of some channels it is nearly all there is. So each channel
 answers for itself, and a model of all says which answer agrees best (fit/instance_revolution.py).
@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from relit.conventions import similarity
 from relit.fit.instances import View
 from relit.fit.revolution import radius_at
+from relit.fit.turns import Cells, Told, best_laid, leads_of, turned_about
 from relit.scene import Camera
 
 TURNS, LATITUDES = 120, 48  # cells of a map
@@ -30,17 +30,7 @@ FLOORS = (0.01, 0.01, 0.1)  # of a channel's standard deviation: what is not dec
 CLIPPED = 6.0  # standard deviations
 AT_ONCE = 14  # views whose shifts are sought together; the others are laid on what these have made
 APART = 25.0  # degrees from which on a turn is another one
-SWEEPS = 4  # in which each is laid again
-
-
-@dataclass(frozen=True)
-class Cells:
-    """What a view in a seat shows of the map, in the channels that are asked. at: (TURNS, C) flat indices of its cells for every shift.
-    values, weights: (C,), what was read there, and what it counts: a cell near the ends is small."""
-
-    at: np.ndarray
-    values: np.ndarray
-    weights: np.ndarray
+CLEAR = 0.3  # evidence for each of its cells, by which the turn of a view that is sure of it leads
 
 
 # ---------------------------------------------------------------- unrolling
@@ -175,77 +165,9 @@ def cells_of(shown: np.ndarray, values: np.ndarray) -> Cells:
     return Cells(np.concatenate(each, 1), values[:, row, column].ravel().astype(np.float64), np.tile(weight, len(values)))
 
 
-def evidence(count: np.ndarray, total: np.ndarray) -> np.ndarray:
+def one_value(count: np.ndarray, total: np.ndarray) -> np.ndarray:
     """Twice the log evidence that readings of variance 1 (half of it noise) have a common value, against none; count of them, and total."""
     return 2 * total**2 / (1 + count) - np.log1p(count)
-
-
-@dataclass
-class Board:
-    """What has been laid down: count and total of the readings in each cell (flat)."""
-
-    count: np.ndarray
-    total: np.ndarray
-
-    def lay(self, cells: Cells, turn: int, sign: int = 1) -> None:
-        np.add.at(self.count, cells.at[turn], sign)
-        np.add.at(self.total, cells.at[turn], sign * cells.values)
-
-    def gains(self, cells: Cells) -> np.ndarray:
-        """(TURNS,) of the evidence, for every shift."""
-        count, total = self.count[cells.at], self.total[cells.at]
-        return (cells.weights * (evidence(count + 1, total + cells.values) - evidence(count, total))).sum(1)
-
-    def best(self, seats: list[Cells]) -> tuple[float, int, int]:
-        """Gain, seat and turn of a view's best place."""
-        gains = [self.gains(cells) for cells in seats]
-        return max((float(g.max()), seat, int(g.argmax())) for seat, g in enumerate(gains))
-
-
-def laid(views: list[list[Cells]], first: int, group: list[int]) -> tuple[float, np.ndarray, np.ndarray]:
-    """(evidence, seats (N,), turns (N,)): the view `first`, then those of the group, each time the one that gains most, then all others;
-    and sweeps in which each is laid again."""
-    size = max(int(cells.at.max()) for seats in views for cells in seats) + 1
-    board, seat, turn = Board(np.zeros(size), np.zeros(size)), np.zeros(len(views), int), np.zeros(len(views), int)
-    board.lay(views[first][0], 0)
-    level = float((views[first][0].weights * evidence(1.0, views[first][0].values)).sum())
-
-    def put(k, found):
-        seat[k], turn[k] = found[1:]
-        board.lay(views[k][seat[k]], turn[k])
-
-    rest = [k for k in group if k != first]
-    while rest:
-        found = {k: board.best(views[k]) for k in rest}
-        k = max(rest, key=lambda k: found[k][0])
-        level += found[k][0]
-        put(k, found[k])
-        rest.remove(k)
-    others = [k for k in range(len(views)) if k not in group and k != first]
-    for k in others:
-        found = board.best(views[k])
-        level += found[0]
-        put(k, found)
-    for _ in range(SWEEPS):
-        before = level
-        for k in range(len(views)):
-            cells = views[k][seat[k]]
-            board.lay(cells, turn[k], -1)
-            level -= board.gains(cells)[turn[k]]
-            found = board.best(views[k])
-            level += found[0]
-            put(k, found)
-        if level - before < 1e-6 * abs(before):
-            break
-    return level, seat, turn
-
-
-@dataclass(frozen=True)
-class Told:
-    """poses: (N, 4, 4) with seat and turn put in. leads: (N,) of the evidence of each over its best other place, see `leads_of`."""
-
-    poses: np.ndarray
-    leads: np.ndarray
 
 
 def turned_by_decoration(views: list[View], profile: np.ndarray, seats: list[list[np.ndarray]]) -> dict[str, Told]:
@@ -254,32 +176,8 @@ def turned_by_decoration(views: list[View], profile: np.ndarray, seats: list[lis
     group = sorted(range(len(views)), key=lambda k: -maps[k][0][0].sum())[:AT_ONCE]
     for channel, use in (*((name, [c]) for c, name in enumerate(CHANNELS)), ("colour and brightness", [0, 1, 2])):
         cells = [[cells_of(shown, values[use]) for shown, values in one] for one in maps]
-        _, chosen, turns = max((laid(cells, k, group) for k in group), key=lambda one: one[0])
+        _, chosen, turns = best_laid(cells, group, one_value)
         poses = np.array([turned_about(some[i], t * 2 * np.pi / TURNS) for some, i, t in zip(seats, chosen, turns, strict=True)])
-        out[channel] = Told(poses, leads_of(cells, chosen, turns))
+        size = [max(len(some[i].values), 1) for some, i in zip(cells, chosen, strict=True)]
+        out[channel] = Told(poses, leads_of(cells, chosen, turns, one_value, APART) >= CLEAR * np.array(size))
     return out
-
-
-def leads_of(views: list[list[Cells]], seat: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """(N,) by how much the evidence of each view, all others laid, is larger than in any other seat, or turned by APART or more; over
-    the number of its cells."""
-    size = max(int(cells.at.max()) for seats in views for cells in seats) + 1
-    board, out = Board(np.zeros(size), np.zeros(size)), []
-    for cells, i, t in zip(views, seat, turn, strict=True):
-        board.lay(cells[i], t)
-    for cells, i, t in zip(views, seat, turn, strict=True):
-        board.lay(cells[i], t, -1)
-        gains = [board.gains(one) for one in cells]
-        own = gains[i][t]
-        away = np.abs((np.arange(TURNS) - t + TURNS // 2) % TURNS - TURNS // 2) * 360 / TURNS >= APART
-        gains[i] = gains[i][away]
-        out.append((own - max(g.max() for g in gains)) / max(len(cells[i].values), 1))
-        board.lay(cells[i], t)
-    return np.array(out)
-
-
-def turned_about(pose: np.ndarray, angle: float) -> np.ndarray:
-    """The pose with the object turned about its axis, by radians."""
-    c, s = np.cos(angle), np.sin(angle)
-    about = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    return similarity(about @ pose[:3, :3], about @ pose[:3, 3])
