@@ -193,8 +193,10 @@ def with_found(
     found, vague = [], []
     for view in others:
         pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key))
-        where = "" if sure else "by its axis alone " if pose is not None else "not "
-        run.say(f"the object with {named(view)} was {where}found in the finished model of the others")
+        if pose is not None and not sure:
+            run.say(f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess")
+        else:
+            run.say(f"the object with {named(view)} was {'' if sure else 'not '}found in the finished model of the others")
         if pose is not None:
             (found if sure else vague).append((view, pose))
     count = len(found) + len(vague)

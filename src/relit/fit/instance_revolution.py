@@ -23,7 +23,7 @@ from relit.geometry.hull import NoShape
 
 FEWEST = 4  # objects: of fewer, silhouettes that something else has can be those of a body of revolution
 LIKELY = 0.96  # score of the best silhouette, revolved, against all others, below which nothing is fitted
-FIRST, NEARLY, EXACT = 0.01, 0.004, 0.001  # misfit (`Revolved.misfit`) of a first fit, of a body with a handle, and of one without
+FIRST, NEARLY, EXACT = 0.006, 0.004, 0.001  # misfit (`Revolved.misfit`) of a first fit, of a body with a handle, and of one without
 OPEN = 5  # seats of the median object, from which on the silhouettes do not tell the axis: those of a ball
 DECORATION = (0.0, 2.0, 0.0, 1.0)  # weights of fit.register's descriptor: silhouettes agree in every turn
 LAID, FLAT = 6, 0.4  # objects from which on a plane tells, and how far from it (root mean square, unit lengths) their middles may lie
