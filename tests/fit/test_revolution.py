@@ -128,7 +128,7 @@ def test_what_has_no_axis_is_not_sure_of_it(radii):
     """Ellipses are the outlines of a body of revolution too: what is not sure of its turns is left to the search."""
     views, _ = pile(*ellipsoid(*radii), 4, 1)
     found = place_revolved(views, crops_of(views), OPTIONS)
-    assert found is None or not found.certain
+    assert found is None or (not found.certain and len(found.placed.unsure) > len(views) / 2)
 
 
 def test_two_maps_of_one_decoration_are_laid_on_each_other():

@@ -27,14 +27,14 @@ from relit.fit.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
 
 ALIKE = 15.0  # degrees within which links tell the same turn
-LEFT_OUT = -1.0  # score of an instance whose place is not known
+LEFT_OUT = -2.0  # score of an instance whose turn about a known axis is not told; that of a place that shows nothing is -1
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances, LEFT_OUT where the place is not known.
-    sure: nearly all of them were sure of their places and agree about as well as the others (`instance_regrowth.believed`), or another
-    search would find the same."""
+    """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances, LEFT_OUT where the turn about the axis
+    is not told. sure: nearly all of them were sure of their places and agree about as well as the others (`instance_regrowth.believed`), or
+    another search would find the same."""
 
     poses: np.ndarray
     scores: np.ndarray
@@ -83,7 +83,7 @@ def linked_sets(views, links, distance: float) -> list[Branch]:
 
 def by_axes(revolved: Placed, say) -> Found:
     """Bodies of revolution as outlines and decoration have them, of which some are not sure of their turn: a search over all poses would
-    lose the axes. Where most are sure the others are left out (score -1), to be sought in the finished model of these."""
+    lose the axes. Where most are sure the others are left out, to be sought in the finished model of these."""
     scores, unsure = revolved.own.copy(), list(revolved.unsure)
     if unsure and mostly_sure(revolved):
         scores[unsure] = LEFT_OUT

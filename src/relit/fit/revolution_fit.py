@@ -35,7 +35,7 @@ APART = 15.0  # degrees between the axes of two seats
 
 @dataclass(frozen=True)
 class Revolved:
-    """profile: see above. poses: (N, 4, 4). misfits: (N,) of the views, see `misfit`."""
+    """profile: see fit/revolution.py. poses: (N, 4, 4). misfits: (N,) of the views, see `misfit`."""
 
     profile: np.ndarray
     poses: np.ndarray
