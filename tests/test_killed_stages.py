@@ -112,6 +112,12 @@ def pile_photo(folder: Path) -> tuple[Path, list[str]]:
     return folder / "photo", ["--set", "without=matching", "--set", "side=48"]
 
 
+def pile_with_ends(folder: Path) -> tuple[Path, list[str]]:
+    """The same with two levels, so that the ends of the pawns are asked about; poses hardly move, as a checkpoint changes how they round."""
+    photo, flags = pile_photo(folder)
+    return photo, [*flags, "--set", "levels=16,24", "--set", "level_steps=10,10", "--set", "refine_poses=1e-12"]
+
+
 def collection_with_held_out(folder: Path) -> tuple[Path, list[str]]:
     photos, words = collection_photos(folder)
     words[words.index("without=links")] = "holdout=5"
@@ -147,6 +153,7 @@ JOBS = [
     (flash_photos, ["surface"]),  # resumed in the mesh, the volume pass is taken up at its end and is done once more
     (pile_photo, ["poses", "joint", "volume", "surface"]),
     (pile_photo, ["mesh"]),
+    (pile_with_ends, ["joint", "vessel", "mesh"]),
     (collection_with_held_out, ["links", "poses", "second_look", "held_out"]),
     (collection_with_a_hollow, ["volume", "hollows", "opened", "mesh", "surface"]),
 ]

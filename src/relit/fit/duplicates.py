@@ -3,6 +3,7 @@
     poses     a virtual camera for each instance; matching, and search by rendering      fit/duplicates_poses.py, fit/instance_search.py
     photos    of several photos of one pile how they stand to each other                 fit/pile_photos.py
     joint     one signed distance field in the object's frame, seen by all virtual cameras, moves with the poses; odd ones out fit/volume.py
+    vessel    ends of a body of revolution: cut off square, and hollow where light says so    fit/vessels.py, fit/vessel_trial.py
     volume    the same once more, from those poses; who was left out is sought in it          fit/duplicates_shape.py, fit/sought_again.py
     mesh       zero level set, decimated; mesh and poses as outlines and textures are; texture atlas; the ground      fit/joint_alignment.py
     surface    one material for all instances and one environment, light traced past all instances and the ground     fit/surface.py
@@ -28,30 +29,26 @@ from relit.fit.duplicates_shape import shape_stages
 from relit.fit.first_material import PAINT, first_material
 from relit.fit.hidden_light import HiddenLight, hidden_from
 from relit.fit.instances import ANOTHER_PHOTO
+from relit.fit.lit_pile import lit_pile
 from relit.fit.pile_scene import (
-    alone_bank,
     ground_colour,
     ground_reflectance,
     light_below,
-    photo_bank,
-    scene_mesh,
-    spread,
 )
 from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
 from relit.fit.unseen import seen_faces
 from relit.fit.unseen_paint import painted_over
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
-from relit.geometry.mesh import vertex_areas
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
-from relit.rendering.transport import NO_TEXELS, TraceableMesh
+from relit.rendering.transport import NO_TEXELS
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 from relit.settings import check_levels
 
 __all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
 LIGHT = "several identical objects under one light are assumed (duplicates)"  # what `relit inspect` says
-STAGES = ("poses", "joint", "volume", "mesh", "surface")
+STAGES = ("poses", "joint", "vessel", "volume", "mesh", "surface")
 FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
 COST = {"draft": (240.0, 1.9e9), "standard": (540.0, 2.0e9), "high": (1500.0, 3.0e9)}  # ten objects; most of it is the search for poses
@@ -75,7 +72,7 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
     else:
-        parts = shape_stages(views, poses, others, on_axes, run, options, seed)
+        parts = shape_stages(shots, views, poses, others, on_axes, run, options, seed)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     camera = photos[0].camera
     maps = run_arrays(run, "surface", "maps") if run.done("surface") else surface_stage(shots, camera, mesh, parts, run, options, seed)
@@ -114,37 +111,15 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
     instance shows is painted like what is next to it. Returns (and keeps) base_color, roughness, metallic, normal, environment and
     ground_colour."""
     o = surface_options(options)
-    pixels = shots[0][0]
     with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
-        turn = camera.world_from_camera[:3, :3]
-        standing = [np.linalg.inv(p) for p in parts["poses"]]
-        middle = np.mean([s[:3, 3] for s in standing], 0)
-        scene_from_photo = similarity(turn, -turn @ middle)
-        ground_level = ground_colour(pixels, parts["plane"])
-        moves = spread(standing, scene_from_photo) if "visibility" in options.without else None
-        pile, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera)
-        whole = pile
-        if moves is not None:
-            whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, moves)
-        numbers = np.flatnonzero(parts["related"])
-        used, cameras = [shots[n][0] for n in numbers], [shots[n][1].with_pose(scene_from_photo @ parts["motions"][n]) for n in numbers]
-        keys = parts["view_keys"]
-        shown = [keys // ANOTHER_PHOTO == n for n in numbers]
-        told = ~np.isin(keys, parts.get("vague", ()))  # what is turned by guess shows nothing at its place
-        shown = [own & told for own in shown]
-        labels = [(keys[own] % ANOTHER_PHOTO).tolist() for own in shown]
-        if moves is None:
-            bank = photo_bank(used, cameras, [set(some) for some in labels], options.max_pixels)
-        else:
-            instances = [parts["view_instances"][own].tolist() for own in shown]
-            placed = [dict(zip(some, of, strict=True)) for some, of in zip(labels, instances, strict=True)]
-            bank = alone_bank(used, cameras, placed, moves, options.max_pixels)
+        up = camera.world_from_camera[:3, :3] @ parts["plane"][1] if len(parts["plane"]) else None
+        ground_level = ground_colour(shots[0][0], parts["plane"])
+        lit = lit_pile(shots, camera, mesh, parts, options.max_pixels, alone="visibility" in options.without)
+        bank, traced, level = lit.bank, lit.traced, lit.level
         face, bary = rasterise_atlas(mesh, o.texture)
         known = face >= 0
         start = fill_gutters(interpolate(parts["base"], mesh.faces, face, bary), known)
-        areas = vertex_areas(mesh)
-        level = float((parts["radiance"].mean(0) * areas[:, None]).sum() / areas.sum() / 3)
-        traced, metallic = TraceableMesh(whole, radiance), PAINT
+        metallic = PAINT
         if "first_material" not in options.without and stage.load("checkpoint") is None:
             # metal alone: each texel stands in many places under the light here, so that roughness finds its way from anywhere
             metallic, _ = first_material(bank, traced, start, known, level, None, o, seed, run.progress("metal or paint"))
@@ -153,16 +128,15 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         if options.gaussians:
             model.gaussians = GaussianLight(options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START)
         gathered = None
-        if "hidden" not in options.without and moves is None:
-            gathered = HiddenLight(traced, hidden_from(traced, cameras), traced.mesh.uvs[:, 0] < NO_TEXELS).before
+        if "hidden" not in options.without and not lit.alone:
+            gathered = HiddenLight(traced, hidden_from(traced, lit.cameras), traced.mesh.uvs[:, 0] < NO_TEXELS).before
         fit_surface(bank, traced, model, o, stage, seed, gathered)
         names = ("base_color", "roughness", "metallic")
         paint = {n: fill_gutters(t, known) for n, t in zip(names, pictures(model.material), strict=True)}
-        paint = painted_over(mesh, shown_faces(pile, len(standing), cameras), paint, face, bary)
+        paint = painted_over(mesh, shown_faces(lit.pile, len(parts["poses"]), lit.cameras), paint, face, bary)
         environment = model.environment.image()
         ground = ground_level
-        if len(parts["plane"]):
-            up = turn @ parts["plane"][1]
+        if up is not None:
             ground = ground_reflectance(environment, up, ground_level)
             environment = light_below(environment, up, ground_level)
         maps = {

@@ -59,6 +59,7 @@ WITHOUT = {
     "refinement": "poses stay as search has found them",
     "textures": "mesh and poses follow the outlines of the labels alone",
     "symmetry": "silhouettes bound the object from the sides that show them alone, also where it is its own mirror image",
+    "vessels": "bodies of revolution end as silhouettes leave them",
     "visibility": "no instance, and no ground, shadows another",
     "normals": "normal priors are not used",
     "metal": "no term pulls metallic to 0 or 1",

@@ -13,10 +13,11 @@ from relit.cameras.se3 import nearest_rotation, rotation_angle, turns_apart
 from relit.conventions import similarity
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
-from relit.fit.duplicates_poses import named
+from relit.fit.duplicates_poses import Shot, named
 from relit.fit.instance_options import Search
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
+from relit.fit.lit_pile import LitPile, lit_pile
 from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
 from relit.fit.odd_instances import odd_instances, view_errors
 from relit.fit.outlines import follow_with_poses
@@ -24,29 +25,40 @@ from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
 from relit.fit.sought_again import sought_again
+from relit.fit.surface import SurfaceOptions
+from relit.fit.vessel_trial import vessel_of
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh
-from relit.geometry.sdf import dense_values, row_features
+from relit.geometry.sdf import dense_values, redistance, resample, row_features
 from relit.rendering.shade_world import instance_radiance, shade_world, start_world_light
 from relit.run import run_arrays
 from relit.scene import Mesh
 
 HOLD = 40  # steps of a volume pass of one level before poses move
+HOLD_OPENED = 100  # the same of a pass that begins with the shape of the one before, mended
 PASSES, ORDINALS = 4, ("first", "second", "third", "fourth")  # volume passes for the poses alone, at most
+JOINT = ("joint", *(f"joint_{k}" for k in range(2, PASSES + 1)))  # their stages
 ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last one
 
 
 def shape_stages(
-    views: list[View], poses: np.ndarray, others: list[View], on_axes: dict[int, np.ndarray], run, options: DuplicatesOptions, seed: int
+    shots: list[Shot],
+    views: list[View],
+    poses: np.ndarray,
+    others: list[View],
+    on_axes: dict[int, np.ndarray],
+    run,
+    options: DuplicatesOptions,
+    seed: int,
 ) -> dict[str, np.ndarray]:
-    """Volume pass, mesh, ground. others: views without poses; on_axes: by key, poses of such as are right up to a turn about the object's y
-    axis. Returns (and keeps) vertices, faces, normals, uvs, base (V, 3), plane (point,
-    normal) or empty; for each instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view);
-    motions (P, 4, 4) first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances
-    (N,) which of the instances it is; vague, keys of those whose turn about the axis is a guess."""
-    views, poses, model, arrived, vague = volume_stage(views, poses, others, on_axes, run, options, seed)
+    """Volume pass, mesh, ground. shots: the photos. others: views without poses; on_axes: by key, poses of such as are right up to a turn
+    about the object's y axis. Returns (and keeps) vertices, faces, normals, uvs, base (V, 3), plane (point, normal) or empty; for each
+    instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view); motions (P, 4, 4)
+    first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances (N,) which of the
+    instances it is; vague, keys of those whose turn about the axis is a guess."""
+    views, poses, model, arrived, vague = volume_stage(shots, views, poses, others, on_axes, run, options, seed)
     rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
@@ -67,8 +79,8 @@ def shape_stages(
             )
             for k, (v, p) in enumerate(zip(views, poses, strict=True))
         ]
-        shown = [np.flatnonzero(scene.of_view == n) for n in range(len(scene.standing))]
-        poses = np.linalg.inv(scene.standing)
+        parts = parts_of(mesh, views, scene, [one[0] for one in seen])
+        poses = parts["poses"]
         plane = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, poses)
         if len(plane) and rate > 0 and len(scene.motions) == 1:
             poses, plane, count = set_down(mesh.vertices, poses, plane, distance_in(values))
@@ -76,24 +88,33 @@ def shape_stages(
                 run.say(f"{count} instances were moved along their lines of sight onto the ground, or onto what they rest on")
         if len(plane) == 0:
             run.say("note: no ground was found that the instances stand on; nothing but they themselves casts shadows")
-        parts = {
-            "vertices": mesh.vertices,
+        parts |= {
             "faces": mesh.faces,
             "normals": mesh.normals,
             "uvs": mesh.uvs,
             "base": seen[0][1],
-            "radiance": np.stack([np.mean([seen[k][0] for k in some], 0) for some in shown]),
             "poses": poses,
-            "keys": np.array([views[some[0]].key for some in shown]),
-            "view_keys": np.array([v.key for v, n in zip(views, scene.of_view, strict=True) if n >= 0]),
-            "view_instances": scene.of_view[scene.of_view >= 0],
-            "motions": np.array([motion_or_none(m) for m in scene.motions]),
-            "related": np.array([m is not None for m in scene.motions]),
             "plane": plane,
             "vague": np.array([v.key for v, _ in vague], int),
         }
         stage.save("mesh", **parts)
     return parts
+
+
+def parts_of(mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """Which instances stand where, and which views show them, as `shape_stages` returns it. radiance: (V, 3) of the mesh's vertices in
+    each view."""
+    shown = [np.flatnonzero(scene.of_view == n) for n in range(len(scene.standing))]
+    return {
+        "vertices": mesh.vertices,
+        "radiance": np.stack([np.mean([radiance[k] for k in some], 0) for some in shown]),
+        "poses": np.linalg.inv(scene.standing),
+        "keys": np.array([views[some[0]].key for some in shown]),
+        "view_keys": np.array([v.key for v, n in zip(views, scene.of_view, strict=True) if n >= 0]),
+        "view_instances": scene.of_view[scene.of_view >= 0],
+        "motions": np.array([motion_or_none(m) for m in scene.motions]),
+        "related": np.array([m is not None for m in scene.motions]),
+    }
 
 
 def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, bool]:
@@ -116,7 +137,7 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     poses, odd, arrived, symmetry = poses.copy(), np.zeros(len(views), bool), False, None
     for number in range(PASSES):
         rest = np.flatnonzero(~odd)
-        name = "joint" if number == 0 else f"joint_{number + 1}"
+        name = JOINT[number]
         some = [views[k] for k in rest]
         poses[rest], odd[rest], disagree, turn, symmetry = joint_stage(some, poses[rest], name, number, run, options, seed, symmetry)
         arrived = disagree and turn < ARRIVED
@@ -155,23 +176,57 @@ def joint_stage(
 
 
 def volume_stage(
-    views: list[View], poses: np.ndarray, others: list[View], on_axes: dict[int, np.ndarray], run, options: DuplicatesOptions, seed: int
+    shots: list[Shot],
+    views: list[View],
+    poses: np.ndarray,
+    others: list[View],
+    on_axes: dict[int, np.ndarray],
+    run,
+    options: DuplicatesOptions,
+    seed: int,
 ):
     """(views, poses, model, arrived: see `joint_stages`, vague) after the volume pass, from the poses of the first ones. Instances that do
     not agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished model.
     vague: (view, pose) of those of `on_axes` (see `shape_stages`) that are not sure of their turn there either."""
-    arrived, symmetry, vague = False, None, []
+    arrived, symmetry, vessel, vague = False, None, None, []
     before = {v.key: p for v, p in zip(views, poses, strict=True)}
     if pose_rate(views, options) > 0:
         poses, odd, arrived, symmetry = joint_stages(views, poses, run, options, seed)
         others = [*others, *(views[k] for k in np.flatnonzero(odd))]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
-    with run.stage("volume", steps=sum(options.level_steps), title="shape and poses (volume pass)") as stage:
-        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still=arrived)
+        vessel = vessel_stage(shots, views, poses, run, options, seed)
+    steps = sum(options.level_steps) if vessel is None else sum(options.level_steps[1:])
+    with run.stage("volume", steps=steps, title="shape and poses (volume pass)") as stage:
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still=arrived, vessel=vessel)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
             on_axes = carried(on_axes, np.array([before[v.key] for v in views]), poses)
             views, poses, vague = with_found(views, poses, others, on_axes, model, bank, run, seed)
         return views, poses, model, arrived, vague
+
+
+def vessel_stage(shots: list[Shot], views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
+    """Distances that the finer levels of the volume pass begin with, where the object is a body of revolution whose ends silhouettes do not
+    show as they are (`fit.vessel_trial.vessel_of`); None for others."""
+    if "vessels" in options.without or len(options.levels) < 2:
+        return None
+    if run.done("vessel"):
+        found = run_arrays(run, "vessel", "vessel")["values"]
+        return found if found.size else None
+    last = [name for name in JOINT if run.done(name)][-1]
+    with run.stage("vessel", title="mouths and lids") as stage:
+        values = redistance(resample(run_arrays(run, last, "checkpoint")["values"], options.levels[1]))
+        scene = related(views, poses)
+        inside = [v.rgb[v.mask > 0.99].mean(0) for v in views]
+
+        def lit(mesh: Mesh) -> LitPile:
+            parts = parts_of(mesh, views, scene, [np.tile(level, (len(mesh.vertices), 1)) for level in inside])
+            parts["plane"] = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, parts["poses"])
+            return lit_pile(shots, shots[0][1], mesh, parts, options.max_pixels, alone="visibility" in options.without)
+
+        o = SurfaceOptions(options.surface_steps, options.points, options.directions, light=options.light, scale_power=1.0)
+        found = vessel_of(values, views, poses, lit, o, run.say, seed, run.progress("mouths and lids"))
+        stage.save("vessel", values=np.zeros((0, 0, 0), np.float32) if found is None else found)
+    return found
 
 
 def carried(some: dict[int, np.ndarray], before: np.ndarray, after: np.ndarray) -> dict[int, np.ndarray]:
@@ -210,22 +265,22 @@ def pose_rate(views: list[View], options: DuplicatesOptions) -> float:
 
 
 def shape_and_poses(
-    views: list[View], poses: np.ndarray, run, stage, options: DuplicatesOptions, seed: int, symmetry=None, still: bool = False
+    views: list[View],
+    poses: np.ndarray,
+    run,
+    stage,
+    options: DuplicatesOptions,
+    seed: int,
+    symmetry: Symmetry | None = None,
+    still: bool = False,
+    vessel: np.ndarray | None = None,
 ):
     """One volume pass: (model, its pixel bank, poses). symmetry: of the shape of the pass before, or None. still: the poses stay as they
-    are."""
+    are. vessel: distances that it begins with in the place of a hull, without the coarse level, or None."""
     bank = pixel_bank(views, poses)
     inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
     beside, there = mirrored_views(symmetry, views, poses) if symmetry else ([], np.zeros((0, 4, 4)))
-    try:
-        values = carved([*views, *beside], np.concatenate([poses, there]), options.levels[0], 0.15, Search.depth, crossed=True)
-    except NoShape:
-        raise UserError(
-            "the silhouettes have nothing in common",
-            "poses are wrong, or the objects differ",
-            "check the label image",
-            code=EXIT_FAILED,
-        ) from None
+    values = vessel if vessel is not None else hull_of([*views, *beside], np.concatenate([poses, there]), options.levels[0])
     model = start_model(values, np.maximum(inside.mean(0), 1e-3), None, full=False)
     scene = related(views, poses, run)
     model.appearance = shade_world if len(scene.motions) == 1 else partial(shade_world, turns=light_turns(views, scene))
@@ -236,7 +291,9 @@ def shape_and_poses(
         move_poses(bank, model)
     # on a coarse grid the shape is wrong by more than the poses, which would follow it away from where they are
     hold = options.level_steps[0] if len(options.levels) > 1 else HOLD
-    o = VolumeOptions(options.levels, options.level_steps, options.rays, refine_cameras=rate, hold=hold)
+    coarse = 0 if vessel is None else 1
+    levels, steps = options.levels[coarse:], options.level_steps[coarse:]
+    o = VolumeOptions(levels, steps, options.rays, refine_cameras=rate, hold=hold if vessel is None else HOLD_OPENED)
 
     def begin_level(model: VolumeModel) -> None:
         if rate > 0 and model.grid.n not in options.levels[:2]:
@@ -244,6 +301,19 @@ def shape_and_poses(
 
     fit_volume(bank, model, o, stage, seed, begin_level)
     return model, bank, moved_poses(bank, views, poses)
+
+
+def hull_of(views: list[View], poses: np.ndarray, nodes: int) -> np.ndarray:
+    """Distances (n, n, n) of the visual hull. Raises UserError where nothing is left."""
+    try:
+        return carved(views, poses, nodes, 0.15, Search.depth, crossed=True)
+    except NoShape:
+        raise UserError(
+            "the silhouettes have nothing in common",
+            "poses are wrong, or the objects differ",
+            "check the label image",
+            code=EXIT_FAILED,
+        ) from None
 
 
 def related(views: list[View], poses: np.ndarray, run=None) -> Scene:

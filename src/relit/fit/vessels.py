@@ -1,0 +1,127 @@
+"""Vessels: the ends of a body of revolution as silhouettes leave them, and what lies under a mouth.
+
+From a few sides an end is never seen from across, and the fitted shape carries a cone there that no silhouette needs. So each end is cut
+off square, as deep as the silhouettes let it be. What is left is flat, or the mouth of a vessel; outlines do not tell which. A hollow has
+a wall as thick as the grid can carry, and its floor at the waist above the foot or at the other end. Whether it explains the photos
+better is for the light to say (fit/vessel_trial.py): the volume pass knows no shadows, and paints them on a lid.
+
+Distances (n, n, n) are those of nodes of the unit frame, negative inside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import binary_dilation, binary_propagation, minimum_filter
+
+from relit.fit.hollows import small_pixels
+from relit.fit.instances import View
+from relit.fit.pile_scene import distance_in
+from relit.geometry.revolution_axis import Axis, revolution_axis
+from relit.geometry.sdf import node_positions, redistance
+from relit.scene import Camera, Mesh
+
+ROUND = 0.055  # median distance of the normals from the axis (`revolution_axis`) up to which a body is one of revolution
+LOST = 0.001  # share of the silhouettes that an end may cost
+LEAST = 1.0  # voxels that an end must lose to be cut
+MOUTH = 0.4  # radius of an end, of the body's, from which on it may be a mouth
+WALL = 1.7  # voxels
+WAIST = 1.08  # the body is so much wider on both sides of a waist
+
+
+@dataclass(frozen=True)
+class End:
+    """One end of a body. sign: of the axis' direction that points out of it; height: along the axis times sign, where it is cut;
+    radius: of the rim."""
+
+    sign: int
+    height: float
+    radius: float
+
+
+def body_axis(mesh: Mesh) -> Axis | None:
+    """The axis of a mesh that is a body of revolution, handles aside; None for others."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    some = np.random.default_rng(0).choice(len(area), 20_000, p=area / area.sum())
+    axis, missed = revolution_axis(corners[some].mean(1), across[some] / area[some, None])
+    return axis if missed <= ROUND else None
+
+
+def covered_from(values: np.ndarray, heights: np.ndarray, views: list[View], cameras: list[Camera]) -> np.ndarray:
+    """The lowest height of what covers it, of every small pixel of the silhouettes that the body covers, all views together. values,
+    heights: (n, n, n) distances and heights of the nodes."""
+    n, inside = values.shape[0], values < 0
+    points, height, out = node_positions(n)[inside].astype(np.float64), heights[inside], []
+    for view, camera in zip(views, cameras, strict=True):
+        scale = np.linalg.norm(camera.centre) * 0.5 * (n - 1) / camera.fx  # a voxel at the centre is a pixel of the small picture
+        w, h = (max(2, round(side * scale)) for side in (camera.width, camera.height))
+        columns, rows, seen = small_pixels(camera, points, w, h)
+        lowest = np.full((h, w), np.inf)
+        np.minimum.at(lowest, (rows, columns), height[seen])
+        solid = cv2.resize((view.mask * view.known).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.9
+        out.append(minimum_filter(lowest, 3)[solid])
+    found = np.concatenate(out)
+    return found[np.isfinite(found)]
+
+
+def ends_of(values: np.ndarray, axis: Axis, views: list[View], cameras: list[Camera]) -> tuple[np.ndarray, list[End]]:
+    """(distances of the body, both ends cut off square as deep as its silhouettes let them be; the ends)."""
+    n = values.shape[0]
+    p, voxel, heights = node_positions(n), 2 / (n - 1), axis.heights(node_positions(n))
+    cuts = {}
+    for sign in (1, -1):
+        most = float((sign * heights[values < 0]).max())
+        cut = float(np.quantile(covered_from(values, sign * heights, views, cameras), 1 - LOST)) + 0.5 * voxel
+        cuts[sign] = cut if cut < most - LEAST * voxel else most + voxel
+    flat = np.maximum(values, np.maximum(heights - cuts[1], -heights - cuts[-1]))
+    radii, ends = axis.radii(p), []
+    for sign, cut in cuts.items():
+        top = (flat < 0) & (sign * heights > min(cut, float((sign * heights[flat < 0]).max())) - 2 * voxel)
+        ends.append(End(sign, cut, float(np.quantile(radii[top], 0.95)) if top.any() else 0.0))
+    return flat, ends
+
+
+def mouths(values: np.ndarray, axis: Axis, ends: list[End]) -> list[End]:
+    """The ends that are wide enough for a mouth, the widest first."""
+    widest = float(np.quantile(axis.radii(node_positions(values.shape[0]))[values < 0], 0.98))
+    return sorted((e for e in ends if e.radius >= MOUTH * widest), key=lambda e: -e.radius)
+
+
+def floor_under(values: np.ndarray, axis: Axis, end: End) -> float:
+    """The height (times the end's sign) of the waist nearest to an end, on both sides of which the body is wider, as at a stem or above a
+    foot; that of the other end where there is none."""
+    p, voxel = node_positions(values.shape[0]), 2 / (values.shape[0] - 1)
+    inside = values < 0
+    h, r = end.sign * axis.heights(p)[inside], axis.radii(p)[inside]
+    levels = np.arange(min(end.height, h.max()) - voxel, h.min(), -voxel)
+    width = np.array([np.quantile(r[near], 0.9) if (near := np.abs(h - level) < voxel).any() else 0.0 for level in levels])
+    before, beyond = np.maximum.accumulate(width), np.maximum.accumulate(width[::-1])[::-1]
+    waists = np.flatnonzero((before > WAIST * width) & (beyond > WAIST * width))
+    if len(waists) == 0:
+        return float(h.min())
+    first = waists[: np.argmax(np.diff(waists, append=len(levels) + 2) > 1) + 1]  # levels of the nearest one
+    return float(levels[first[np.argmin(width[first])]])
+
+
+def hollowed(values: np.ndarray, flat: np.ndarray, axis: Axis, end: End, raised: float = 0.0) -> np.ndarray | None:
+    """Distances of the body `flat` with a hollow under an end; None where there is no room for one. values: the body before its ends were
+    cut; the wall is everything within WALL voxels of its side, which goes on straight to the end. raised: how far the floor lies above
+    `floor_under`, as a part of the way to the rim."""
+    n = values.shape[0]
+    voxel = 2 / (n - 1)
+    wall, heights = WALL * voxel, end.sign * axis.heights(node_positions(n))
+    over = np.maximum(heights - (end.height - wall - voxel), 0)[..., None]  # farther up it would be the end that is near, not the side
+    side = distance_in(redistance(values))(node_positions(n) - over * end.sign * axis.direction)
+    lowest = floor_under(flat, axis, end)
+    floor = lowest + raised * (end.height - lowest) + wall
+    hole = np.maximum(side + wall, floor - heights)
+    open_ = hole < 0
+    reached = binary_propagation(open_ & (heights > end.height - voxel) & (heights < end.height + 2 * voxel), mask=open_)
+    if not (reached & (flat < 0)).any():
+        return None
+    hole = np.where(binary_dilation(reached, iterations=2), hole, np.abs(hole))
+    return np.maximum(flat, -hole)
