@@ -113,7 +113,7 @@ def pile_photo(folder: Path) -> tuple[Path, list[str]]:
 
 
 def pile_with_ends(folder: Path) -> tuple[Path, list[str]]:
-    """The same with two levels, so that the ends of the pawns are asked about; poses hardly move, as a checkpoint changes how they round."""
+    """The same with two levels, so that the ends of the pawns are asked about. Poses hardly move: a checkpoint changes how they round."""
     photo, flags = pile_photo(folder)
     return photo, [*flags, "--set", "levels=16,24", "--set", "level_steps=10,10", "--set", "refine_poses=1e-12"]
 
