@@ -63,6 +63,23 @@ def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
         assert (sought_again(hidden, guide, poses[0], model, 1.0, None)[0] is None) == out
 
 
+def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_a_guess(lump, monkeypatch):
+    model, (guide, _), poses = lump
+    shifted = poses[[0, 0, 0]]
+    shifted[1, :3, 3] += [0.4, 0.0, 0.0]
+    shifted[2, :3, 3] += [0.01, 0.0, 0.0]
+    shares = module.overlaps(guide, shifted, model)
+    assert shares[0] > 0.97 and shares[1] < 0.8 < shares[2]
+    turned = poses[[0, 0]]
+    turned[1, :3, 3] += [0.4, 0.0, 0.0]
+    monkeypatch.setattr(module, "candidates", lambda *_: turned)
+    monkeypatch.setattr(module, "descended", lambda *_: (turned, np.array([50.0, 20.0])))  # nothing agrees, least where it is right
+    found, certain = sought_again(guide, guide, poses[0], model, 1.0, None, revolved=True)
+    assert np.array_equal(found, poses[0]) and not certain
+    monkeypatch.setattr(module, "overlaps", lambda *_: np.full(2 * module.ROUNDS, 0.5))
+    assert sought_again(guide, guide, poses[0], model, 1.0, None, revolved=True) == (None, False)
+
+
 def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
     _, (guide, hidden), poses = lump
     asked = []

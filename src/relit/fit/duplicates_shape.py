@@ -27,6 +27,7 @@ from relit.fit.pixels import PixelBank
 from relit.fit.sought_again import sought_again
 from relit.fit.surface import SurfaceOptions
 from relit.fit.vessel_trial import vessel_of
+from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.atlas import unwrap
 from relit.geometry.hull import NoShape
@@ -187,7 +188,7 @@ def volume_stage(
 ):
     """(views, poses, model, arrived: see `joint_stages`, vague) after the volume pass, from the poses of the first ones. Instances that do
     not agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished model.
-    vague: (view, pose) of those of `on_axes` (see `shape_stages`) that are not sure of their turn there either."""
+    vague: (view, pose) of those whose axis alone is told, by `on_axes` (see `shape_stages`) or by the silhouette in the model."""
     arrived, symmetry, vessel, vague = False, None, None, []
     before = {v.key: p for v, p in zip(views, poses, strict=True)}
     if pose_rate(views, options) > 0:
@@ -245,9 +246,9 @@ def with_found(
     """(views, poses, vague: see `volume_stage`) with those of `others` that are found in the model, which gets their entries."""
     level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
-    found, vague = [], []
+    found, vague, revolved = [], [], body_axis(extract_mesh(dense_values(model.grid))) is not None
     for view in others:
-        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key))
+        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), revolved)
         if pose is not None and not sure:
             run.say(f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess")
         else:

@@ -21,7 +21,7 @@ from relit.fit.instance_options import DETAILED
 from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved_poses, pixel_bank
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
-from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from
+from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from, volume_render
 from relit.fit.turns import turned_about
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
@@ -32,6 +32,7 @@ TRIES = 12  # places of an instance that are tried, half of them under each desc
 APART = 12.0
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
+OUTLINE = 0.95  # overlap of silhouettes from which on a place of a body of revolution is right up to a turn about the axis
 TURNS = 24  # about an axis that is known
 ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
@@ -46,15 +47,17 @@ def sought_again(
     turns: Callable | None,
     seed: int = 0,
     on_axis: np.ndarray | None = None,
+    revolved: bool = False,
 ):
     """(pose (4, 4) of `view` in the model or None, is that certain): None where what it shows agrees with the model nowhere, or in several
     places.
 
     guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
     `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
-    about the object's y axis: all turns are tried, and the best is taken, certain or not.
+    about the object's y axis: all turns are tried, and the best is taken, certain or not. revolved: the object is a body of revolution,
+    handles aside, whose silhouette tells all but that turn: where nothing is certain the best place whose silhouette agrees is taken.
     """
-    distance = float(np.linalg.norm(guide_pose[:3, 3]))
+    distance, tried = float(np.linalg.norm(guide_pose[:3, 3])), []
     for turn in range(ROUNDS if on_axis is None else 1):
         poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis)
         if len(poses) == 0:
@@ -65,9 +68,24 @@ def sought_again(
         certain = errors[best] <= AGREES * level and all(e >= CLEARLY * errors[best] for e in elsewhere)
         if certain or on_axis is not None:
             return poses[best], certain
+        tried.append((poses, errors))
         if errors[best] <= AGREES * level:
             break
+    if revolved and tried:
+        poses, errors = (np.concatenate(part) for part in zip(*tried, strict=True))
+        agree = overlaps(view, poses, model) >= OUTLINE
+        if np.isfinite(errors[agree]).any():
+            return poses[agree][np.nanargmin(errors[agree])], False
     return None, False
+
+
+def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
+    """(K,) intersection over union of the view's silhouette and the model's at poses (K, 4, 4), where it is known."""
+    h, w = view.mask.shape
+    square = replace(view.camera, width=max(h, w), height=max(h, w))
+    drawn = volume_render(model)([square.with_pose(p) for p in poses])[1][:, :h, :w] > 0.5
+    own, known = view.mask > 0.5, view.known > 0.5
+    return (drawn & own & known).sum((1, 2)) / np.maximum(((drawn | own) & known).sum((1, 2)), 1)
 
 
 def all_turns(pose: np.ndarray) -> np.ndarray:
