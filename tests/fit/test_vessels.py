@@ -96,6 +96,17 @@ def test_ends_are_cut_where_silhouettes_let_them_be():
     assert ends[0].height > TOP - 3 * voxel and [e.sign for e in mouths(flat, UP, ends)] == [-1]
 
 
+def test_a_thin_tip_stays():
+    """Thinner than a voxel in the photos, and a node wide in the body: its silhouette is there all the same."""
+    fine = node_positions(160)
+    r, y = np.hypot(fine[..., 0], fine[..., 2]), fine[..., 1]
+    views, cameras = silhouettes(((np.abs(y) < TOP) & (r < side(y))) | ((y > 0) & (y < 0.75) & (r < 0.02)))
+    r, y = np.hypot(P[..., 0], P[..., 2]), P[..., 1]
+    body = np.maximum(np.abs(y) - TOP, r - side(y))
+    ends = ends_of(np.minimum(body, np.maximum(np.abs(y - 0.4) - 0.35, r - 0.04)), UP, views, cameras)[1]
+    assert ends[0].height > 0.65 and abs(ends[1].height - TOP) < 0.06
+
+
 def test_a_hollow_has_a_wall_and_a_floor():
     n = 96
     p, voxel = node_positions(n), 2 / 95

@@ -51,21 +51,24 @@ def body_axis(mesh: Mesh) -> Axis | None:
     return axis if missed <= ROUND else None
 
 
-def covered_from(values: np.ndarray, heights: np.ndarray, views: list[View], cameras: list[Camera]) -> np.ndarray:
-    """The lowest height of what covers it, of every small pixel of the silhouettes that the body covers, all views together. values,
+def lowest_cut(values: np.ndarray, heights: np.ndarray, views: list[View], cameras: list[Camera]) -> float:
+    """The height above which all can be taken away so that the silhouettes lose LOST of their area, of what the body covers. values,
     heights: (n, n, n) distances and heights of the nodes."""
     n, inside = values.shape[0], values < 0
-    points, height, out = node_positions(n)[inside].astype(np.float64), heights[inside], []
+    points, height, found = node_positions(n)[inside].astype(np.float64), heights[inside], []
     for view, camera in zip(views, cameras, strict=True):
         scale = np.linalg.norm(camera.centre) * 0.5 * (n - 1) / camera.fx  # a voxel at the centre is a pixel of the small picture
         w, h = (max(2, round(side * scale)) for side in (camera.width, camera.height))
         columns, rows, seen = small_pixels(camera, points, w, h)
-        lowest = np.full((h, w), np.inf)
+        lowest = np.full((h, w), np.inf)  # of what covers the pixel
         np.minimum.at(lowest, (rows, columns), height[seen])
-        solid = cv2.resize((view.mask * view.known).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.9
-        out.append(minimum_filter(lowest, 3)[solid])
-    found = np.concatenate(out)
-    return found[np.isfinite(found)]
+        area = cv2.resize((view.mask * view.known).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
+        found.append(np.stack([minimum_filter(lowest, 3), area], -1).reshape(-1, 2))
+    lowest, area = np.concatenate(found).T
+    order = np.argsort(lowest)
+    order = order[np.isfinite(lowest[order])]
+    share = np.cumsum(area[order]) / area[order].sum()
+    return float(lowest[order[min(np.searchsorted(share, 1 - LOST), len(order) - 1)]])
 
 
 def ends_of(values: np.ndarray, axis: Axis, views: list[View], cameras: list[Camera]) -> tuple[np.ndarray, list[End]]:
@@ -75,7 +78,7 @@ def ends_of(values: np.ndarray, axis: Axis, views: list[View], cameras: list[Cam
     cuts = {}
     for sign in (1, -1):
         most = float((sign * heights[values < 0]).max())
-        cut = float(np.quantile(covered_from(values, sign * heights, views, cameras), 1 - LOST)) + 0.5 * voxel
+        cut = lowest_cut(values, sign * heights, views, cameras) + 0.5 * voxel
         cuts[sign] = cut if cut < most - LEAST * voxel else most + voxel
     flat = np.maximum(values, np.maximum(heights - cuts[1], -heights - cuts[-1]))
     radii, ends = axis.radii(p), []
