@@ -29,13 +29,9 @@ from relit.fit.duplicates_shape import shape_stages
 from relit.fit.first_material import PAINT, first_material
 from relit.fit.hidden_light import HiddenLight, hidden_from
 from relit.fit.instances import ANOTHER_PHOTO
-from relit.fit.lit_pile import lit_pile
-from relit.fit.pile_scene import (
-    ground_colour,
-    ground_reflectance,
-    light_below,
-)
-from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
+from relit.fit.lit_pile import lit_pile, surface_options
+from relit.fit.pile_scene import ground_colour, ground_reflectance, light_below
+from relit.fit.surface import ALBEDO_START, fit_surface, start_surface
 from relit.fit.unseen import seen_faces
 from relit.fit.unseen_paint import painted_over
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -99,11 +95,6 @@ def with_normals(pixels: Pixels, options: DuplicatesOptions) -> Pixels:
 
 
 # ---------------------------------------------------------------- material and light
-
-
-def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
-    off = {"metallic_binary": 0.0, "metallic_sparse": 0.0} if "metal" in o.without else {}
-    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, scale_power=1.0, **off)
 
 
 def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: DuplicatesOptions, seed: int) -> dict[str, np.ndarray]:

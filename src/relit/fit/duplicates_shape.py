@@ -17,7 +17,7 @@ from relit.fit.duplicates_poses import Shot, named
 from relit.fit.instance_options import Search
 from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
-from relit.fit.lit_pile import LitPile, lit_pile
+from relit.fit.lit_pile import LitPile, lit_pile, surface_options
 from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
 from relit.fit.odd_instances import odd_instances, view_errors
 from relit.fit.outlines import follow_with_poses
@@ -25,7 +25,6 @@ from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
 from relit.fit.sought_again import sought_again
-from relit.fit.surface import SurfaceOptions
 from relit.fit.vessel_trial import vessel_of
 from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
@@ -224,8 +223,7 @@ def vessel_stage(shots: list[Shot], views: list[View], poses: np.ndarray, run, o
             parts["plane"] = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, parts["poses"])
             return lit_pile(shots, shots[0][1], mesh, parts, options.max_pixels, alone="visibility" in options.without)
 
-        o = SurfaceOptions(options.surface_steps, options.points, options.directions, light=options.light, scale_power=1.0)
-        found = vessel_of(values, views, poses, lit, o, run.say, seed, run.progress("mouths and lids"))
+        found = vessel_of(values, views, poses, lit, surface_options(options), run.say, seed, run.progress("mouths and lids"))
         stage.save("vessel", values=np.zeros((0, 0, 0), np.float32) if found is None else found)
     return found
 

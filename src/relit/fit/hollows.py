@@ -153,8 +153,7 @@ def bare(cameras: list[Camera], left: np.ndarray, gone: np.ndarray) -> np.ndarra
     solid, asked = p[left].astype(np.float64), p[gone].astype(np.float64)
     out = np.zeros(len(asked), int)
     for camera in cameras:
-        scale = np.linalg.norm(camera.centre) * 0.5 * (n - 1) / camera.fx  # a voxel at the centre is a pixel of the small picture
-        w, h = (max(2, round(side * scale)) for side in (camera.width, camera.height))
+        w, h = small_size(camera, n)
         columns, rows, _ = small_pixels(camera, solid, w, h)
         cover = np.zeros((h, w), bool)
         cover[rows, columns] = True
@@ -164,6 +163,12 @@ def bare(cameras: list[Camera], left: np.ndarray, gone: np.ndarray) -> np.ndarra
     found = np.zeros(gone.shape, int)
     found[gone] = out
     return found
+
+
+def small_size(camera: Camera, nodes: int) -> tuple[int, int]:
+    """Width and height of the small picture in which a voxel at the centre, of so many nodes a side, is a pixel."""
+    scale = np.linalg.norm(camera.centre) * 0.5 * (nodes - 1) / camera.fx
+    return max(2, round(camera.width * scale)), max(2, round(camera.height * scale))
 
 
 def small_pixels(camera: Camera, points: np.ndarray, width: int, height: int):

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from relit.conventions import similarity
+from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instances import ANOTHER_PHOTO
 from relit.fit.pile_scene import alone_bank, photo_bank, scene_mesh, spread
 from relit.fit.pixels import PixelBank
+from relit.fit.surface import SurfaceOptions
 from relit.geometry.mesh import vertex_areas
 from relit.rendering.transport import TraceableMesh
 from relit.scene import Camera, Mesh
@@ -26,6 +28,11 @@ class LitPile:
     pile: Mesh
     cameras: list[Camera]
     level: float
+
+
+def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
+    off = {"metallic_binary": 0.0, "metallic_sparse": 0.0} if "metal" in o.without else {}
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, scale_power=1.0, **off)
 
 
 def lit_pile(shots, camera: Camera, mesh: Mesh, parts, max_pixels: int, *, alone: bool = False) -> LitPile:

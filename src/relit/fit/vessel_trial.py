@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.first_material import TRIAL
+from relit.fit.instances import View
 from relit.fit.lit_pile import LitPile
 from relit.fit.loop import NoStage
 from relit.fit.pixels import saturated_at
@@ -39,7 +40,7 @@ PIXELS = 200  # of them must meet a mouth that is asked
 
 def vessel_of(
     values: np.ndarray,
-    views,
+    views: list[View],
     poses: np.ndarray,
     lit: Callable[[Mesh], LitPile],
     options: SurfaceOptions,
@@ -82,8 +83,6 @@ def vessel_of(
 def lowest_of(changes: list[float]) -> float:
     """Where the parabola through what the FLOORS give is lowest, between the first and the last of them; the best one where it has no
     lowest point."""
-    if not np.isfinite(changes).all():
-        return FLOORS[int(np.argmin(changes))]
     bend, slope, _ = np.polyfit(FLOORS, changes, 2)
     return float(np.clip(-slope / (2 * bend), FLOORS[0], FLOORS[-1])) if bend > 0 else FLOORS[int(np.argmin(changes))]
 

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import trimesh
 from scipy.ndimage import binary_dilation, binary_propagation, minimum_filter
 
-from relit.fit.hollows import small_pixels
+from relit.fit.hollows import small_pixels, small_size
 from relit.fit.instances import View
 from relit.fit.pile_scene import distance_in
 from relit.geometry.revolution_axis import Axis, revolution_axis
@@ -24,6 +25,7 @@ from relit.geometry.sdf import node_positions, redistance
 from relit.scene import Camera, Mesh
 
 ROUND = 0.055  # median distance of the normals from the axis (`revolution_axis`) up to which a body is one of revolution
+SAMPLES = 20_000  # points of the surface whose normals are asked
 LOST = 0.001  # share of the silhouettes that an end may cost
 LEAST = 1.0  # voxels that an end must lose to be cut
 MOUTH = 0.4  # radius of an end, of the body's, from which on it may be a mouth
@@ -43,11 +45,9 @@ class End:
 
 def body_axis(mesh: Mesh) -> Axis | None:
     """The axis of a mesh that is a body of revolution, handles aside; None for others."""
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1)
-    some = np.random.default_rng(0).choice(len(area), 20_000, p=area / area.sum())
-    axis, missed = revolution_axis(corners[some].mean(1), across[some] / area[some, None])
+    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    points, face = trimesh.sample.sample_surface(surface, SAMPLES, seed=0)
+    axis, missed = revolution_axis(np.asarray(points), surface.face_normals[face])
     return axis if missed <= ROUND else None
 
 
@@ -57,8 +57,7 @@ def lowest_cut(values: np.ndarray, heights: np.ndarray, views: list[View], camer
     n, inside = values.shape[0], values < 0
     points, height, found = node_positions(n)[inside].astype(np.float64), heights[inside], []
     for view, camera in zip(views, cameras, strict=True):
-        scale = np.linalg.norm(camera.centre) * 0.5 * (n - 1) / camera.fx  # a voxel at the centre is a pixel of the small picture
-        w, h = (max(2, round(side * scale)) for side in (camera.width, camera.height))
+        w, h = small_size(camera, n)
         columns, rows, seen = small_pixels(camera, points, w, h)
         lowest = np.full((h, w), np.inf)  # of what covers the pixel
         np.minimum.at(lowest, (rows, columns), height[seen])
@@ -74,8 +73,8 @@ def lowest_cut(values: np.ndarray, heights: np.ndarray, views: list[View], camer
 def ends_of(values: np.ndarray, axis: Axis, views: list[View], cameras: list[Camera]) -> tuple[np.ndarray, list[End]]:
     """(distances of the body, both ends cut off square as deep as its silhouettes let them be; the ends)."""
     n = values.shape[0]
-    p, voxel, heights = node_positions(n), 2 / (n - 1), axis.heights(node_positions(n))
-    cuts = {}
+    p, voxel = node_positions(n), 2 / (n - 1)
+    heights, cuts = axis.heights(p), {}
     for sign in (1, -1):
         most = float((sign * heights[values < 0]).max())
         cut = lowest_cut(values, sign * heights, views, cameras) + 0.5 * voxel
@@ -114,11 +113,10 @@ def hollowed(values: np.ndarray, flat: np.ndarray, axis: Axis, end: End, raised:
     """Distances of the body `flat` with a hollow under an end; None where there is no room for one. values: the body before its ends were
     cut; the wall is everything within WALL voxels of its side, which goes on straight to the end. raised: how far the floor lies above
     `floor_under`, as a part of the way to the rim."""
-    n = values.shape[0]
-    voxel = 2 / (n - 1)
-    wall, heights = WALL * voxel, end.sign * axis.heights(node_positions(n))
+    p, voxel = node_positions(values.shape[0]), 2 / (values.shape[0] - 1)
+    wall, heights = WALL * voxel, end.sign * axis.heights(p)
     over = np.maximum(heights - (end.height - wall - voxel), 0)[..., None]  # farther up it would be the end that is near, not the side
-    side = distance_in(redistance(values))(node_positions(n) - over * end.sign * axis.direction)
+    side = distance_in(redistance(values))(p - over * end.sign * axis.direction)
     lowest = floor_under(flat, axis, end)
     floor = lowest + raised * (end.height - lowest) + wall
     hole = np.maximum(side + wall, floor - heights)
