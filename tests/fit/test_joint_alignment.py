@@ -118,7 +118,7 @@ def test_derivatives_are_those_of_the_projection(seen):
 def test_pictures_lie_on_each_other_where_all_is_right(seen):
     mesh, cameras, pictures, masks = seen
     shifts = texture_shifts(mesh, cameras, pictures, masks)
-    assert len(shifts) == len(neighbours(cameras)) >= 20 and misfit(shifts) < 0.15
+    assert {(s.view, s.other) for s in shifts} == set(neighbours(cameras)) and len(neighbours(cameras)) >= 20 and misfit(shifts) < 0.15
     assert misfit([]) == 0
 
 
@@ -130,7 +130,7 @@ def test_a_pose_is_asked_back_by_the_pixels_that_it_is_off(seen):
     mine = [s for s in shifts if s.view == 0]
     asked = np.concatenate([(cameras[0].project(s.point) - wrong[0].project(s.point))[:, :2] for s in mine])
     told = np.concatenate([s.shift for s in mine])
-    assert len(mine) >= 4 and np.linalg.norm(asked, axis=1).mean() > 1.5
+    assert len(mine) >= 4 and np.linalg.norm(asked, axis=1).mean() > 1.3
     assert np.corrcoef(asked.ravel(), told.ravel())[0, 1] > 0.85
     assert 0.5 < (told * asked).sum() / (asked * asked).sum() < 1.1  # flow shrinks: rounds make up for it
     placed = wrong

@@ -3,8 +3,9 @@
 `fit.outlines` believes the labels to a tenth of a pixel, and poses follow them. Labels that people or networks draw leave out wheels, cut
 corners and waver by a pixel or two; poses that follow those blur the texture, as each instance paints it in another place. So the textures
 are asked (`fit.texture_shifts`): where they lie clearly off, labels or shape are wrong, and outlines and textures are solved for together,
-each weighted by what its samples scatter. Labels that agree are left alone: they know more than optical flow does. Where textures do not
-come to lie on one another so, it is the shape that is wrong, often by the depth of a whole side, and it may bend further.
+each weighted by what its samples scatter. Labels that agree are left alone: they know more than optical flow does. Where no poses bring
+textures to lie on one another, it is the shape that is wrong, often by the depth of a whole side, and from where labels have left it it may
+bend further.
 
 One Gauss-Newton step for all poses and the displacements d of the vertices along their normals n. A place X that view j shows where view i
 shows it too moves in view i by
@@ -37,12 +38,12 @@ from relit.fit.outlines import (
     precision,
     spread_of,
 )
-from relit.fit.texture_shifts import Shifts, misfit, texture_shifts
+from relit.fit.texture_shifts import Shifts, misfit, shares, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
 EXACT = 0.7  # pixels by which textures may be off before they have a part in it
-TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, then of a softer mesh
+TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, or both of a softer mesh
 SHARP = 0.5  # pixels by which textures may be off before the shape is doubted
 YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
 LABELS = 0.7  # pixels; what has contradicted textures is told no better than this
@@ -76,26 +77,35 @@ def follow_views(mesh: Mesh, cameras: list[Camera], pictures, masks, known, roun
     before = misfit(texture_shifts(outlined, with_poses(cameras, poses), pictures, masks))
     if before <= EXACT:
         return outlined, poses, ""
-    found, placed, spread = outlined, with_poses(cameras, poses), 0.0
-    for n in range(TEXTURES + BOTH + SOFT):
-        shifts = texture_shifts(found, placed, pictures, masks)
-        if not shifts:
-            return outlined, poses, ""
-        rows = texture_rows(shifts, placed)
-        if n < TEXTURES:
-            _, placed = solved(found, placed, rows, still=True)
-        elif n < TEXTURES + BOTH:
-            found, placed = solved(found, placed, rows + outline_rows(found, placed, masks, known)[0])
-        elif n == TEXTURES + BOTH and misfit(shifts) < SHARP:
-            break
-        else:
-            others, spread = outline_rows(found, placed, masks, known, max(spread, LABELS))
-            found, placed = solved(found, placed, rows + others, stiffness=YIELDING)
+    placed = by_textures(outlined, with_poses(cameras, poses), pictures, masks)
+    if misfit(texture_shifts(outlined, placed, pictures, masks)) < SHARP:
+        found, placed = by_both(outlined, placed, pictures, masks, known, BOTH)
+    else:  # not the labels, then: the shape
+        found, placed = by_both(outlined, with_poses(cameras, poses), pictures, masks, known, SOFT, YIELDING)
     after = misfit(texture_shifts(found, placed, pictures, masks))
     if not 0 < after < before:
         return outlined, poses, ""
     said = f"poses that follow the labels alone leave textures {before:.1f} pixels off (median): they follow both now ({after:.1f} pixels)"
     return found, np.array([c.world_from_camera for c in placed]), said
+
+
+def by_textures(mesh: Mesh, placed: list[Camera], pictures, masks) -> list[Camera]:
+    """The cameras after TEXTURES rounds in which textures alone move them."""
+    for _ in range(TEXTURES):
+        shifts = texture_shifts(mesh, placed, pictures, masks)
+        placed = solved(mesh, placed, texture_rows(shifts, placed), still=True)[1] if shifts else placed
+    return placed
+
+
+def by_both(mesh: Mesh, placed: list[Camera], pictures, masks, known, rounds: int, softer: tuple[float, float] | None = None):
+    """(mesh, cameras) after so many rounds in which outlines and textures move both. softer: in the place of STIFF and REST; outlines then
+    count however far they are off."""
+    spread = 0.0
+    for _ in range(rounds):
+        rows = texture_rows(texture_shifts(mesh, placed, pictures, masks), placed)
+        outlines, spread = outline_rows(mesh, placed, masks, known, max(spread, LABELS) if softer else 0.0)
+        mesh, placed = solved(mesh, placed, rows + outlines, stiffness=softer or (STIFF, REST))
+    return mesh, placed
 
 
 def with_poses(cameras: list[Camera], poses: np.ndarray) -> list[Camera]:
@@ -125,14 +135,14 @@ def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
     """Two equations for each place, x and y."""
     spread = max(1.48 * misfit(shifts) / 1.18, FAINTEST)  # of one coordinate: the median length is 1.18 deviations
     out = []
-    for s in shifts:
+    for s, share in zip(shifts, shares(shifts), strict=True):
         here, turn_here = projection(cameras[s.view], s.point)
         there, turn_there = projection(cameras[s.other], s.point)
         t = tangents(s.normal)
         m = (here @ t) @ np.linalg.pinv(there @ t)
         along = ((here - m @ there) @ s.normal[..., None])[..., 0]
         far = np.linalg.norm(s.shift, axis=1) / (OUTLIER * spread)
-        trust = (np.linalg.norm(m, axis=(1, 2)) < SLANTED) / (spread * (1 + far**2)) ** 2
+        trust = (np.linalg.norm(m, axis=(1, 2)) < SLANTED) * share / (spread * (1 + far**2)) ** 2
         views = np.full(len(far), s.view), np.full(len(far), s.other)
         for axis in (0, 1):
             poses = [(views[0], turn_here[:, axis]), (views[1], -(m @ turn_there)[:, axis])]

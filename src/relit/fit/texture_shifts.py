@@ -21,13 +21,16 @@ from relit.fit.unseen import seen_points
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
-ACROSS = 60.0  # degrees between two lines of sight up to which pictures are compared
+ACROSS = 100.0  # degrees between two lines of sight up to which pictures are compared
 NEIGHBOURS = 6  # views that each is compared with, the nearest ones
 GRAZING = 0.25  # cosine, below which a place is not looked up
 LOCAL = 6.0  # pixels, the neighbourhood whose brightness and contrast do not count
 PATCH = 3.0  # pixels, the neighbourhood that must look alike
 ALIKE = 0.6  # correlation of two patches
-STRUCTURE = 0.003  # smaller eigenvalue of the structure tensor, in contrasts a pixel, squared
+STRUCTURE = 0.006  # smaller eigenvalue of the structure tensor, in contrasts a pixel, squared
+CLEAR = 0.98  # quantile of it, from which on places count in full
+BORDER = 0.1, 9  # of the root of the area that both views show, and pixels at most: so much along its border does not count
+DIM = 0.15  # of the tint; what is darker has hardly a colour
 BACK = 0.7  # pixels by which there and back may miss
 FARTHEST = 12.0  # pixels
 SAMPLES = 250  # of a pair at most
@@ -38,7 +41,8 @@ OVERLAP = 400  # pixels that a pair must share
 @dataclass(frozen=True)
 class Shifts:
     """Places (N,) that view `other` shows as well as view `view`. corners, weights: (N, 3) vertices of the faces there, and their shares.
-    point, normal: (N, 3) in the frame of the mesh. shift: (N, 2) pixels of `view` by which the place must move there, x and y."""
+    point, normal: (N, 3) in the frame of the mesh. shift: (N, 2) pixels of `view` by which the place must move there, x and y. structure:
+    (N,) of the picture there, see STRUCTURE."""
 
     view: int
     other: int
@@ -47,6 +51,7 @@ class Shifts:
     point: np.ndarray
     normal: np.ndarray
     shift: np.ndarray
+    structure: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -65,14 +70,28 @@ def texture_shifts(mesh: Mesh, cameras: list[Camera], pictures: list[np.ndarray]
     masks: (h, w). Pairs that share too little, or hardly any structure, are left out."""
     scene = build_geometry(mesh)
     shown = [shown_by(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
-    found = [shifts_of(mesh, scene, i, j, shown[i], cameras, pictures, masks[j]) for i, j in neighbours(cameras)]
-    return [one for one in found if one is not None]
+    tint = np.mean([p[m > 0.5].mean(0) for p, m in zip(pictures, masks, strict=True)], 0)
+    channels = [channels_of(p, tint) for p in pictures]
+    return [one for i, j in neighbours(cameras) for one in shifts_of(mesh, scene, i, j, shown[i], cameras, channels, masks[j])]
 
 
 def misfit(shifts: list[Shifts]) -> float:
-    """Median length of the shifts in pixels; 0 where there are none."""
-    lengths = [np.linalg.norm(s.shift, axis=1) for s in shifts]
-    return float(np.median(np.concatenate(lengths))) if lengths else 0.0
+    """Median length of the shifts in pixels, by what they count (see `shares`); 0 where there are none."""
+    if not shifts:
+        return 0.0
+    length, weight = np.concatenate([np.linalg.norm(s.shift, axis=1) for s in shifts]), np.concatenate(shares(shifts))
+    order = np.argsort(length)
+    return float(length[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
+
+
+def shares(shifts: list[Shifts]) -> list[np.ndarray]:
+    """What each place counts: flow is the surer, and the likelier right at all, the more structure there is. What most weight lies on
+    counts 1."""
+    structure = [s.structure for s in shifts]
+    clear = np.quantile(np.concatenate(structure), CLEAR)
+    some = [np.minimum(s / clear, 1) ** 2 for s in structure]
+    every = np.concatenate(some)
+    return [s * every.sum() / (every**2).sum() for s in some]
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
@@ -100,29 +119,41 @@ def places_of(mesh: Mesh, scene, camera: Camera, x: np.ndarray, y: np.ndarray):
     return hit, corners, weights, point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
 
 
-def shifts_of(mesh: Mesh, scene, i: int, j: int, shown: Shown, cameras: list[Camera], pictures, mask: np.ndarray) -> Shifts | None:
-    """Of view i, which shows `shown`, against view j with its mask."""
+def shifts_of(mesh: Mesh, scene, i: int, j: int, shown: Shown, cameras: list[Camera], channels, mask: np.ndarray) -> list[Shifts]:
+    """Of view i, which shows `shown`, against view j with its mask; of each of their channels (h, w, C) that has structure."""
     point = shown.point[shown.hit]
     x, y, _ = cameras[j].project(point).T
     common = seen_points(scene, point, shown.normal[shown.hit], [cameras[j]], GRAZING)
     common &= map_coordinates(mask, [y - 0.5, x - 0.5], order=1, mode="constant") > 0.9
-    both = np.zeros(shown.hit.shape, bool)
+    both, out = np.zeros(shown.hit.shape, bool), []
     both[shown.hit] = common
     if both.sum() < OVERLAP:
-        return None
-    brought = np.zeros(both.shape, np.float32)
-    brought[shown.hit] = map_coordinates(brightness(pictures[j]), [y - 0.5, x - 0.5], order=1, mode="nearest")
-    a, b = contrasts(brightness(pictures[i]), both), contrasts(brought, both)
-    flow, good = confirmed_flow(a, b, both)
-    row, column = np.nonzero(good)
-    if len(row) < LEAST:
-        return None
-    chosen = np.unique(np.linspace(0, len(row) - 1, min(SAMPLES, len(row))).round().astype(int))
-    row, column = row[chosen], column[chosen]
-    shift = flow[row, column].astype(np.float64)
-    # where the other shows that place now
-    hit, *places = places_of(mesh, scene, cameras[i], column + 0.5 + shift[:, 0], row + 0.5 + shift[:, 1])
-    return Shifts(i, j, *(a[hit] for a in (*places, -shift)))
+        return out
+    (top, bottom), (left, right) = ((a.min(), a.max() + 1) for a in np.nonzero(both))
+    box = np.s_[top:bottom, left:right]
+    for here, there in zip(np.moveaxis(channels[i], -1, 0), np.moveaxis(channels[j], -1, 0), strict=True):
+        brought = np.zeros(both.shape, np.float32)
+        brought[shown.hit] = map_coordinates(there, [y - 0.5, x - 0.5], order=1, mode="nearest")
+        flow, structure = confirmed_flow(contrasts(here[box], both[box]), contrasts(brought[box], both[box]), both[box])
+        row, column = np.nonzero(structure)
+        if len(row) < LEAST:
+            continue
+        chosen = np.unique(np.linspace(0, len(row) - 1, min(SAMPLES, len(row))).round().astype(int))
+        row, column = row[chosen], column[chosen]
+        shift, structure = flow[row, column].astype(np.float64), structure[row, column]
+        row, column = row + top, column + left
+        # where the other shows that place now
+        hit, *places = places_of(mesh, scene, cameras[i], column + 0.5 + shift[:, 0], row + 0.5 + shift[:, 1])
+        out.append(Shifts(i, j, *(a[hit] for a in (*places, -shift, structure))))
+    return out
+
+
+def channels_of(picture: np.ndarray, tint: np.ndarray) -> np.ndarray:
+    """(h, w, 3) of a picture (h, w, 3): its brightness as displays show it, and the shares of red and blue against a tint (3,), which
+    shading and what is mirrored in the object's own colour leave alone."""
+    solid = np.maximum(picture, 0) / np.maximum(tint, 1e-4)
+    shares = solid[..., [0, 2]] / (solid.sum(-1, keepdims=True) + DIM)
+    return np.concatenate([brightness(picture)[..., None], shares], -1).astype(np.float32)
 
 
 def brightness(picture: np.ndarray) -> np.ndarray:
@@ -139,7 +170,7 @@ def contrasts(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 
 def confirmed_flow(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(flow (h, w, 2) with a(x) = b(x + flow), where it is to be believed (h, w)) of two pictures of contrasts."""
+    """(flow (h, w, 2) with a(x) = b(x + flow), structure (h, w) where it is to be believed, else 0) of two pictures of contrasts."""
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     grey = [np.clip(40 * p + 128, 0, 255).astype(np.uint8) for p in (a, b)]
     flow, back = dis.calc(*grey, None), dis.calc(*grey[::-1], None)
@@ -157,7 +188,9 @@ def confirmed_flow(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> tuple[np.
     alike = (around(a * c) - around(a) * around(c)) / np.sqrt(spread) > ALIKE
     right, down = (cv2.Sobel(a, cv2.CV_32F, *axis) / 8 for axis in ((1, 0), (0, 1)))
     xx, yy, xy = around(right**2), around(down**2), around(right * down)
-    structured = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy) > STRUCTURE
-    inner = cv2.erode(where.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    structure = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    border = int(min(BORDER[0] * np.sqrt(where.sum()), BORDER[1]))  # what ends where both pictures do has not moved
+    inner = cv2.erode(np.pad(where, 1).astype(np.uint8), np.ones((2 * border + 1, 2 * border + 1), np.uint8))[1:-1, 1:-1] > 0
     stays = moved(where.astype(np.float32)) > 0.99
-    return flow, inner & stays & returns & alike & structured & (np.hypot(*np.moveaxis(flow, -1, 0)) < FARTHEST)
+    good = inner & stays & returns & alike & (structure > STRUCTURE) & (np.hypot(*np.moveaxis(flow, -1, 0)) < FARTHEST)
+    return flow, np.where(good, structure, 0)
