@@ -108,6 +108,15 @@ def test_a_group_begins_on_the_side_that_explains_it_clearly_better(metal, metal
     assert not is_metal[1] and not is_dull[1]
 
 
+def test_paint_that_gains_by_the_light_of_a_metal_beside_it_stays_paint():
+    """Groups that lose a half, a third and a sixth of their error; alone, the last one is metal."""
+    gains = np.array([0.5, 0.33, 0.17])
+    paint, dull = (np.stack([e * np.ones(3), [10] * 3, [100] * 3], 1) for e in (100.0, 110.0))
+    metal = np.stack([100 * (1 - gains), [80] * 3, [100] * 3], 1)
+    assert first.explained_better(paint, metal, dull)[0].tolist() == [True, True, False]
+    assert first.explained_better(paint[2:], metal[2:], dull[2:])[0].tolist() == [True]
+
+
 @pytest.mark.parametrize("other, taken", [(0.8, True), (1.0, False), (1.2, False)])
 def test_paint_that_hardly_gains_follows_the_rest_of_the_paint(other, taken):
     """The first group gains 2 % as dull paint, which short fits leave uncertain; the second, twice as large, decides, not the metal."""

@@ -18,6 +18,7 @@ from relit.fit.odd_instances import view_errors
 from relit.fit.register import volume_render
 from relit.fit.sought_again import sought_again
 from relit.fit.turns import turned_about
+from relit.geometry.revolution_axis import Axis
 from relit.rendering.shade_world import shade_world, start_world_light
 
 
@@ -63,21 +64,34 @@ def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
         assert (sought_again(hidden, guide, poses[0], model, 1.0, None)[0] is None) == out
 
 
-def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_a_guess(lump, monkeypatch):
+def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turned(lump, monkeypatch):
     model, (guide, _), poses = lump
     shifted = poses[[0, 0, 0]]
     shifted[1, :3, 3] += [0.4, 0.0, 0.0]
     shifted[2, :3, 3] += [0.01, 0.0, 0.0]
     shares = module.overlaps(guide, shifted, model)
     assert shares[0] > 0.97 and shares[1] < 0.8 < shares[2]
-    turned = poses[[0, 0]]
-    turned[1, :3, 3] += [0.4, 0.0, 0.0]
-    monkeypatch.setattr(module, "candidates", lambda *_: turned)
-    monkeypatch.setattr(module, "descended", lambda *_: (turned, np.array([50.0, 20.0])))  # nothing agrees, least where it is right
-    found, certain = sought_again(guide, guide, poses[0], model, 1.0, None, revolved=True)
-    assert np.array_equal(found, poses[0]) and not certain
-    monkeypatch.setattr(module, "overlaps", lambda *_: np.full(2 * module.ROUNDS, 0.5))
-    assert sought_again(guide, guide, poses[0], model, 1.0, None, revolved=True) == (None, False)
+    axis = Axis(np.array([0.1, 0.0, -0.2]), np.array([0.6, 0.8, 0.0]))
+    tried = np.stack([module.all_turns(poses[0], axis)[5], shifted[1]])
+    monkeypatch.setattr(module, "candidates", lambda *_: tried)
+
+    def sought(apart):
+        def descended(view, guide, guide_pose, some, *_):
+            if len(some) == 2:  # nothing agrees, least where the silhouette does not
+                return some, np.array([50.0, 20.0])
+            return some, apart + np.array([rotation_angle(p[:3, :3].T @ poses[0][:3, :3]) for p in some])
+
+        monkeypatch.setattr(module, "descended", descended)
+        return sought_again(guide, guide, poses[0], model, 1.0, None, axis=axis)
+
+    monkeypatch.setattr(
+        module, "overlaps", lambda view, some, model: np.where(np.arange(len(some)) % 2 if len(some) == 6 else False, 0.5, 1)
+    )
+    for apart, expected in ((30.0, False), (1.0, True)):
+        found, certain = sought(apart)
+        assert np.allclose(found, poses[0]) and certain == expected
+    monkeypatch.setattr(module, "overlaps", lambda view, some, model: np.full(len(some), 0.5))
+    assert sought(1.0) == (None, False)
 
 
 def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):

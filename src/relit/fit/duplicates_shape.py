@@ -244,9 +244,9 @@ def with_found(
     """(views, poses, vague: see `volume_stage`) with those of `others` that are found in the model, which gets their entries."""
     level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
-    found, vague, revolved = [], [], body_axis(extract_mesh(dense_values(model.grid))) is not None
+    found, vague, axis = [], [], body_axis(extract_mesh(dense_values(model.grid)))
     for view in others:
-        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), revolved)
+        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), axis)
         if pose is not None and not sure:
             run.say(f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess")
         else:

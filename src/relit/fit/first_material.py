@@ -29,6 +29,7 @@ DULL = 0.65  # first roughness of what is explained better so than with the usua
 SIDES = ((PAINT, None), (0.5, None), (PAINT, DULL))  # first metallic and roughness (None: the options') of the short fits
 GROUPS = 6  # of like colours
 GAIN = 0.13  # metal: the error must fall by this share; from the wrong side it rises, or falls by less than a tenth
+OF_BEST = 0.35  # and by so much of what falls for the group that gains most: paint gains too by the light that a metal beside it tells
 DULL_GAIN = 0.04  # dull: less is enough, since roughness alone is at stake and can still move
 FLOOR = 0.005  # of the error of a pixel: what is explained so well needs no other explanation
 ROSE = 0.54  # mean metallic of a group that is metal, after the short fit from .5
@@ -113,10 +114,11 @@ def errors(bank: PixelBank, mesh: TraceableMesh, model: SurfaceModel, o: Surface
 
 def explained_better(paint: np.ndarray, metal: np.ndarray, dull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which groups are metal and which are dull paint, (G,) bool each, from the `errors` of the three fits. Metal: explained clearly better
-    from that side, and become more of a metal; dull: no metal, and explained better so. Fits as short as these leave the gain of one group
-    uncertain by several hundredths; paint of one object is mostly alike, so half of what counts is the gain of all paint together.
-    What clearly loses stays."""
-    is_metal = (gain(paint, metal) > GAIN) & (metal[:, 1] > ROSE * metal[:, 2]) & (metal[:, 0] < dull[:, 0])
+    from that side, also beside what gains most, and become more of a metal; dull: no metal, and explained better so. Fits as short as
+    these leave the gain of one group uncertain by several hundredths; paint of one object is mostly alike, so half of what counts is the
+    gain of all paint together. What clearly loses stays."""
+    gained = gain(paint, metal)
+    is_metal = (gained > max(GAIN, OF_BEST * gained.max())) & (metal[:, 1] > ROSE * metal[:, 2]) & (metal[:, 0] < dull[:, 0])
     together = gain(*(fit[~is_metal].sum(0, keepdims=True) for fit in (paint, dull)))
     alone = gain(paint, dull)
     return is_metal, ((alone + together) / 2 > DULL_GAIN) & (alone > -DULL_GAIN) & ~is_metal

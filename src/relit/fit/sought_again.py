@@ -14,7 +14,8 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
-from relit.cameras.se3 import rotation_angle
+from relit.cameras.se3 import exp_so3, rotation_angle
+from relit.conventions import similarity
 from relit.fit.instance_growth import ANOTHER
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED
@@ -22,8 +23,9 @@ from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from, volume_render
-from relit.fit.turns import turned_about
+from relit.fit.revolution import UP
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.geometry.revolution_axis import Axis
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
 
 VIEWPOINTS = 2500
@@ -47,36 +49,52 @@ def sought_again(
     turns: Callable | None,
     seed: int = 0,
     on_axis: np.ndarray | None = None,
-    revolved: bool = False,
+    axis: Axis | None = None,
 ):
     """(pose (4, 4) of `view` in the model or None, is that certain): None where what it shows agrees with the model nowhere, or in several
     places.
 
     guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
     `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
-    about the object's y axis: all turns are tried, and the best is taken, certain or not. revolved: the object is a body of revolution,
-    handles aside, whose silhouette tells all but that turn: where nothing is certain the best place whose silhouette agrees is taken.
+    about the object's y axis: all turns are tried, and the best is taken, certain or not. axis: of an object that is a body of revolution,
+    handles aside, whose silhouette tells all but the turn about it: where nothing is certain the best place whose silhouette agrees is
+    taken, and all turns are tried there.
     """
     distance, tried = float(np.linalg.norm(guide_pose[:3, 3])), []
     for turn in range(ROUNDS if on_axis is None else 1):
-        poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis)
+        poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis, Axis(np.zeros(3), UP))
         if len(poses) == 0:
             continue
         poses, errors = descended(view, guide, guide_pose, poses, model, turns, seed + turn)
-        best = int(np.nanargmin(errors))
-        elsewhere = [e for p, e in zip(poses, errors, strict=True) if rotation_angle(p[:3, :3].T @ poses[best][:3, :3]) > ANOTHER]
-        certain = errors[best] <= AGREES * level and all(e >= CLEARLY * errors[best] for e in elsewhere)
+        pose, certain = likeliest(poses, errors, level)
         if certain or on_axis is not None:
-            return poses[best], certain
+            return pose, certain
         tried.append((poses, errors))
-        if errors[best] <= AGREES * level:
+        if np.nanmin(errors) <= AGREES * level:
             break
-    if revolved and tried:
-        poses, errors = (np.concatenate(part) for part in zip(*tried, strict=True))
-        agree = overlaps(view, poses, model) >= OUTLINE
-        if np.isfinite(errors[agree]).any():
-            return poses[agree][np.nanargmin(errors[agree])], False
-    return None, False
+    if axis is None or not tried:
+        return None, False
+    poses, errors = (np.concatenate(part) for part in zip(*tried, strict=True))
+    errors = where_outlines_agree(errors, view, poses, model)
+    if not np.isfinite(errors).any():
+        return None, False
+    pose, _ = likeliest(poses, errors, level)
+    poses, errors = descended(view, guide, guide_pose, all_turns(pose, axis), model, turns, seed)
+    errors = where_outlines_agree(errors, view, poses, model)
+    return likeliest(poses, errors, level) if np.isfinite(errors).any() else (pose, False)
+
+
+def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.ndarray, bool]:
+    """(the pose with the least of the errors (K,), is it certain: it agrees, and clearly better than any other place does). level: see
+    `sought_again`."""
+    best = int(np.nanargmin(errors))
+    elsewhere = [e for p, e in zip(poses, errors, strict=True) if rotation_angle(p[:3, :3].T @ poses[best][:3, :3]) > ANOTHER]
+    return poses[best], bool(errors[best] <= AGREES * level and all(e >= CLEARLY * errors[best] for e in elsewhere))
+
+
+def where_outlines_agree(errors: np.ndarray, view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
+    """The errors (K,) of places whose silhouettes agree with the view's, nan for others."""
+    return np.where(overlaps(view, poses, model) >= OUTLINE, errors, np.nan)
 
 
 def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
@@ -88,9 +106,10 @@ def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
     return (drawn & own & known).sum((1, 2)) / np.maximum(((drawn | own) & known).sum((1, 2)), 1)
 
 
-def all_turns(pose: np.ndarray) -> np.ndarray:
+def all_turns(pose: np.ndarray, axis: Axis) -> np.ndarray:
     """(TURNS, 4, 4): the pose with the object turned about its axis."""
-    return np.array([turned_about(pose, a) for a in np.arange(TURNS) * 2 * np.pi / TURNS])
+    about = [exp_so3(a * axis.direction) for a in np.arange(TURNS) * 2 * np.pi / TURNS]
+    return np.array([similarity(r, axis.point - r @ axis.point) @ pose for r in about])
 
 
 def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:
