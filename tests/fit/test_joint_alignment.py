@@ -9,7 +9,6 @@ import trimesh
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import move_points
 from relit.fit import joint_alignment
-from relit.fit import texture_shifts as texture_module
 from relit.fit.joint_alignment import (
     EXACT,
     follow_views,
@@ -208,7 +207,6 @@ def test_a_shape_that_is_wrong_bends_until_textures_agree(monkeypatch):
     wrong = replace(mesh, vertices=(v * bulge).astype(np.float32))
     placed = astray(cameras, 4.0)
     ends = {}
-    monkeypatch.setattr(texture_module, "NEIGHBOURS", 3)  # for speed
     for rounds in (0, 16):
         monkeypatch.setattr(joint_alignment, "SOFT", rounds)
         found, poses, _ = follow_views(wrong, placed, pictures, masks, everywhere(masks), 5)
