@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from relit.cameras.se3 import exp_so3, rotation_angle
-from relit.conventions import move_points
+from relit.conventions import linear_from_srgb, move_points, srgb_from_linear
 from relit.fit import joint_alignment
 from relit.fit.joint_alignment import (
     EXACT,
@@ -21,7 +21,7 @@ from relit.fit.joint_alignment import (
     with_poses,
 )
 from relit.fit.outlines import follow_with_poses, trace
-from relit.fit.texture_shifts import neighbours, shown_by, texture_shifts
+from relit.fit.texture_shifts import brightness, neighbours, shares, shown_by, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
@@ -194,6 +194,34 @@ def test_without_texture_outlines_are_followed_alone(seen):
     _, poses, said = follow_views(mesh, cameras, plain, masks, everywhere(masks), 2)
     np.testing.assert_array_equal(poses, follow_with_poses(mesh, cameras, masks, everywhere(masks), 2)[1])
     assert said == ""
+
+
+def test_colour_tells_where_brightness_does_not(seen):
+    """Red and blue change, what a display shows of the three together does not."""
+    mesh, cameras, pictures, masks = seen
+    even = []
+    for picture in pictures:
+        shown = srgb_from_linear(np.clip(picture, 0, 1))
+        red = 0.5 + (shown[..., 0] - shown[..., 1])
+        even.append(linear_from_srgb(np.stack([red, np.full_like(red, 0.5), 1.0 - red], -1)).astype(np.float32))
+    assert np.ptp(brightness(even[0])) < 1e-5
+    wrong = [astray(cameras[:1], 2.0, seed=4)[0], *cameras[1:]]
+    shifts = texture_shifts(mesh, wrong, even, masks)
+    mine = [s for s in shifts if s.view == 0]
+    asked = np.concatenate([(cameras[0].project(s.point) - wrong[0].project(s.point))[:, :2] for s in mine])
+    told = np.concatenate([s.shift for s in mine])
+    assert len(mine) >= 4 and np.corrcoef(asked.ravel(), told.ravel())[0, 1] > 0.8
+
+
+def test_places_count_by_their_structure(seen):
+    """Half of the places have ten times the structure of the others: what these say hardly matters."""
+    mesh, cameras, pictures, masks = seen
+    one = texture_shifts(mesh, cameras, pictures, masks)[0]
+    clear = np.arange(len(one.shift)) % 2 == 0
+    some = replace(one, structure=np.where(clear, 0.1, 0.01), shift=np.where(clear[:, None], [[1.0, 0.0]], [[0.0, 9.0]]))
+    (share,) = shares([some])
+    assert share[clear].min() > 50 * share[~clear].max() and np.average(share, weights=share) == pytest.approx(1.0)
+    assert misfit([some]) == 1.0
 
 
 def test_a_shape_that_is_wrong_bends_until_textures_agree(monkeypatch):
