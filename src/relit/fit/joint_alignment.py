@@ -24,6 +24,7 @@ import numpy as np
 from scipy.sparse import bmat, coo_matrix, diags, identity
 from scipy.sparse.linalg import splu
 
+from relit.cameras.se3 import turns_apart
 from relit.fit.outlines import (
     FAR,
     FARTHEST,
@@ -44,6 +45,7 @@ from relit.scene import Camera, Mesh
 
 EXACT = 0.7  # pixels by which textures may be off before they have a part in it
 TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, or both of a softer mesh
+SETTLED = 0.02  # degrees by which a pose turns in the last one
 SHARP = 0.5  # pixels by which textures may be off before the shape is doubted
 YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
 LABELS = 0.7  # pixels; what has contradicted textures is told no better than this
@@ -90,22 +92,32 @@ def follow_views(mesh: Mesh, cameras: list[Camera], pictures, masks, known, roun
 
 
 def by_textures(mesh: Mesh, placed: list[Camera], pictures, masks) -> list[Camera]:
-    """The cameras after TEXTURES rounds in which textures alone move them."""
+    """The cameras after at most TEXTURES rounds in which textures alone move them."""
     for _ in range(TEXTURES):
-        shifts = texture_shifts(mesh, placed, pictures, masks)
+        shifts, before = texture_shifts(mesh, placed, pictures, masks), placed
         placed = solved(mesh, placed, texture_rows(shifts, placed), still=True)[1] if shifts else placed
+        if settled(before, placed):
+            break
     return placed
 
 
 def by_both(mesh: Mesh, placed: list[Camera], pictures, masks, known, rounds: int, softer: tuple[float, float] | None = None):
-    """(mesh, cameras) after so many rounds in which outlines and textures move both. softer: in the place of STIFF and REST; outlines then
-    count however far they are off."""
+    """(mesh, cameras) after at most so many rounds in which outlines and textures move both. softer: in the place of STIFF and REST;
+    outlines then count however far they are off."""
     spread = 0.0
     for _ in range(rounds):
-        rows = texture_rows(texture_shifts(mesh, placed, pictures, masks), placed)
+        rows, before = texture_rows(texture_shifts(mesh, placed, pictures, masks), placed), placed
         outlines, spread = outline_rows(mesh, placed, masks, known, max(spread, LABELS) if softer else 0.0)
         mesh, placed = solved(mesh, placed, rows + outlines, stiffness=softer or (STIFF, REST))
+        if settled(before, placed):
+            break
     return mesh, placed
+
+
+def settled(before: list[Camera], after: list[Camera]) -> bool:
+    """Whether a round has turned no camera by more than SETTLED."""
+    turns = turns_apart(*(np.array([c.world_from_camera for c in cameras]) for cameras in (before, after)))
+    return bool(np.max(turns) <= SETTLED)
 
 
 def with_poses(cameras: list[Camera], poses: np.ndarray) -> list[Camera]:
