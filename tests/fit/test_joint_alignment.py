@@ -20,7 +20,7 @@ from relit.fit.joint_alignment import (
     with_poses,
 )
 from relit.fit.outlines import follow_with_poses, trace
-from relit.fit.texture_shifts import brightness, neighbours, shares, shown_by, texture_shifts
+from relit.fit.texture_shifts import agreement, brightness, neighbours, shares, shown_by, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
@@ -221,6 +221,19 @@ def test_places_count_by_their_structure(seen):
     (share,) = shares([some])
     assert share[clear].min() > 50 * share[~clear].max() and np.average(share, weights=share) == pytest.approx(1.0)
     assert misfit([some]) == 1.0
+
+
+def test_the_right_pose_of_a_view_shows_what_the_others_show(seen):
+    """Of poses turned by up to 40 degrees about the line of sight of nobody; each view has its own light."""
+    mesh, cameras, pictures, masks = seen
+    own, up = np.asarray(cameras[0].world_from_camera), [0.2, 0.9, 0.3] / np.linalg.norm([0.2, 0.9, 0.3])
+    poses = []
+    for degrees in (-40, -20, -6, 0, 6, 20, 40):
+        turn = np.eye(4)
+        turn[:3, :3] = exp_so3(np.radians(degrees) * up)
+        poses.append(turn @ own)
+    told = agreement(mesh, cameras[1:], pictures[1:], masks[1:], cameras[0], pictures[0], masks[0], np.array(poses))
+    assert told.argmax() == 3 and told[3] > 3 * max(told[0], told[1], told[5], told[6], 0)
 
 
 def test_a_shape_that_is_wrong_bends_until_textures_agree():

@@ -25,6 +25,7 @@ from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
 from relit.fit.sought_again import sought_again
+from relit.fit.texture_shifts import agreement
 from relit.fit.vessel_trial import vessel_of
 from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
@@ -244,9 +245,11 @@ def with_found(
     """(views, poses, vague: see `volume_stage`) with those of `others` that are found in the model, which gets their entries."""
     level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
-    found, vague, axis = [], [], body_axis(extract_mesh(dense_values(model.grid)))
+    mesh = extract_mesh(dense_values(model.grid))
+    found, vague, axis = [], [], body_axis(mesh)
+    alike = partial(alike_by, mesh, views, poses)
     for view in others:
-        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), axis)
+        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), axis, alike)
         if pose is not None and not sure:
             run.say(f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess")
         else:
@@ -256,6 +259,12 @@ def with_found(
     count = len(found) + len(vague)
     model.reflections = mi.Float(np.concatenate([np.array(model.reflections), np.zeros(4 * count, np.float32)]))
     return [*views, *(v for v, _ in found)], np.concatenate([poses, *(p[None] for _, p in found)]), vague
+
+
+def alike_by(mesh: Mesh, views: list[View], poses: np.ndarray, view: View, some: np.ndarray) -> np.ndarray:
+    """(K,) how much what a view shows is like what those of `views` show of the mesh, for each of its poses `some` (K, 4, 4)."""
+    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+    return agreement(mesh, cameras, [v.rgb for v in views], [v.mask for v in views], view.camera, view.rgb, view.mask * view.known, some)
 
 
 def pose_rate(views: list[View], options: DuplicatesOptions) -> float:

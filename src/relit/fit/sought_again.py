@@ -50,6 +50,7 @@ def sought_again(
     seed: int = 0,
     on_axis: np.ndarray | None = None,
     axis: Axis | None = None,
+    alike: Callable[[View, np.ndarray], np.ndarray] | None = None,
 ):
     """(pose (4, 4) of `view` in the model or None, is that certain): None where what it shows agrees with the model nowhere, or in several
     places.
@@ -58,7 +59,8 @@ def sought_again(
     `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
     about the object's y axis: all turns are tried, and the best is taken, certain or not. axis: of an object that is a body of revolution,
     handles aside, whose silhouette tells all but the turn about it: where nothing is certain the best place whose silhouette agrees is
-    taken, and all turns are tried there.
+    taken, and all turns are tried there; if none is certain either, the one by which the view shows what others show (`alike`: (K,) of a
+    view at poses (K, 4, 4), as `texture_shifts.agreement`).
     """
     distance, tried = float(np.linalg.norm(guide_pose[:3, 3])), []
     for turn in range(ROUNDS if on_axis is None else 1):
@@ -81,7 +83,13 @@ def sought_again(
     pose, _ = likeliest(poses, errors, level)
     poses, errors = descended(view, guide, guide_pose, all_turns(pose, axis), model, turns, seed)
     errors = where_outlines_agree(errors, view, poses, model)
-    return likeliest(poses, errors, level) if np.isfinite(errors).any() else (pose, False)
+    if not np.isfinite(errors).any():
+        return pose, False
+    pose, certain = likeliest(poses, errors, level)
+    if not certain and alike is not None:
+        poses = poses[np.isfinite(errors)]
+        pose = poses[np.argmax(alike(view, poses))]
+    return pose, certain
 
 
 def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.ndarray, bool]:

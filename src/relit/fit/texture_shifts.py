@@ -121,19 +121,14 @@ def places_of(mesh: Mesh, scene, camera: Camera, x: np.ndarray, y: np.ndarray):
 
 def shifts_of(mesh: Mesh, scene, i: int, j: int, shown: Shown, cameras: list[Camera], channels, mask: np.ndarray) -> list[Shifts]:
     """Of view i, which shows `shown`, against view j with its mask; of each of their channels (h, w, C) that has structure."""
-    point = shown.point[shown.hit]
-    x, y, _ = cameras[j].project(point).T
-    common = seen_points(scene, point, shown.normal[shown.hit], [cameras[j]], GRAZING)
-    common &= map_coordinates(mask, [y - 0.5, x - 0.5], order=1, mode="constant") > 0.9
-    both, out = np.zeros(shown.hit.shape, bool), []
-    both[shown.hit] = common
+    both, x, y = met_by(scene, shown, cameras[j], mask)
+    out = []
     if both.sum() < OVERLAP:
         return out
     (top, bottom), (left, right) = ((a.min(), a.max() + 1) for a in np.nonzero(both))
     box = np.s_[top:bottom, left:right]
     for here, there in zip(np.moveaxis(channels[i], -1, 0), np.moveaxis(channels[j], -1, 0), strict=True):
-        brought = np.zeros(both.shape, np.float32)
-        brought[shown.hit] = map_coordinates(there, [y - 0.5, x - 0.5], order=1, mode="nearest")
+        brought = brought_to(shown, there, x, y)
         flow, structure = confirmed_flow(contrasts(here[box], both[box]), contrasts(brought[box], both[box]), both[box])
         row, column = np.nonzero(structure)
         if len(row) < LEAST:
@@ -146,6 +141,45 @@ def shifts_of(mesh: Mesh, scene, i: int, j: int, shown: Shown, cameras: list[Cam
         hit, *places = places_of(mesh, scene, cameras[i], column + 0.5 + shift[:, 0], row + 0.5 + shift[:, 1])
         out.append(Shifts(i, j, *(a[hit] for a in (*places, -shift, structure))))
     return out
+
+
+def met_by(scene, shown: Shown, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((h, w) bool, which pixels of what a view shows a camera sees too, inside its mask; where it sees all that is hit, x and y (N,))."""
+    point = shown.point[shown.hit]
+    x, y, _ = camera.project(point).T
+    common = seen_points(scene, point, shown.normal[shown.hit], [camera], GRAZING)
+    common &= map_coordinates(mask, [y - 0.5, x - 0.5], order=1, mode="constant") > 0.9
+    both = np.zeros(shown.hit.shape, bool)
+    both[shown.hit] = common
+    return both, x, y
+
+
+def brought_to(shown: Shown, picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(h, w) of a view: what a picture has at positions (N,), where the view hits."""
+    brought = np.zeros(shown.hit.shape, np.float32)
+    brought[shown.hit] = map_coordinates(picture, [y - 0.5, x - 0.5], order=1, mode="nearest")
+    return brought
+
+
+def agreement(mesh: Mesh, cameras: list[Camera], pictures, masks, view: Camera, picture, mask, poses: np.ndarray) -> np.ndarray:
+    """(K,) evidence, for each of poses (K, 4, 4) of another view, that its picture (h, w, 3) shows the same pattern as those of the views
+    that look from the nearest sides: - n / 2 log(1 - ρ²) for each, ρ the correlation of their brightness, freed of what is local, and n
+    the patches that both show."""
+    scene, bright = build_geometry(mesh), [brightness(p) for p in pictures]
+    sides, own, out = np.array([c.centre / np.linalg.norm(c.centre) for c in cameras]), brightness(picture), []
+    for pose in poses:
+        camera, evidence = view.with_pose(pose), 0.0
+        shown = shown_by(mesh, scene, camera, mask)
+        for j in np.argsort(-sides @ camera.centre)[:NEIGHBOURS]:
+            both, x, y = met_by(scene, shown, cameras[j], masks[j])
+            if both.sum() < OVERLAP:
+                continue
+            inner = cv2.erode(both.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+            a, b = (contrasts(p, both)[inner] for p in (own, brought_to(shown, bright[j], x, y)))
+            rho = np.clip((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-6), -0.99, 0.99)
+            evidence -= np.sign(rho) * inner.sum() / (np.pi * PATCH**2) / 2 * np.log1p(-(rho**2))
+        out.append(evidence)
+    return np.array(out)
 
 
 def channels_of(picture: np.ndarray, tint: np.ndarray) -> np.ndarray:
