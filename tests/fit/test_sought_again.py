@@ -72,29 +72,27 @@ def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turne
     shares = module.overlaps(guide, shifted, model)
     assert shares[0] > 0.97 and shares[1] < 0.8 < shares[2]
     axis = Axis(np.array([0.1, 0.0, -0.2]), np.array([0.6, 0.8, 0.0]))
-    tried = np.stack([module.all_turns(poses[0], axis)[5], shifted[1]])
+    tried = np.stack([module.turned_by(poses[0], axis, 1.01), shifted[1]])
     monkeypatch.setattr(module, "candidates", lambda *_: tried)
+    monkeypatch.setattr(module, "descended", lambda *_: (tried, np.array([50.0, 20.0])))  # nothing agrees, least where the outline does not
+    monkeypatch.setattr(module, "overlaps", lambda _, some, model: np.where(np.arange(len(some)) % 2 > 0, 0.5, 1))
 
-    def sought(apart, alike=None):
-        def descended(view, guide, guide_pose, some, *_):
-            if len(some) == 2:  # nothing agrees, least where the silhouette does not
-                return some, np.array([50.0, 20.0])
-            return some, apart + np.array([rotation_angle(p[:3, :3].T @ poses[0][:3, :3]) for p in some])
+    def alike(elsewhere):
+        """Peaks of three degrees at the true turn, and at one 100 degrees from there."""
 
-        monkeypatch.setattr(module, "descended", descended)
-        return sought_again(guide, guide, poses[0], model, 1.0, None, axis=axis, alike=alike)
+        def evidence(_, some):
+            apart = [[rotation_angle(p[:3, :3].T @ module.turned_by(poses[0], axis, a)[:3, :3]) for a in (0.0, 1.75)] for p in some]
+            return (np.exp(-((np.array(apart) / 3) ** 2)) * [100.0, elsewhere]).sum(1)
 
-    monkeypatch.setattr(
-        module, "overlaps", lambda view, some, model: np.where(np.arange(len(some)) % 2 if len(some) == 6 else False, 0.5, 1)
-    )
-    for apart, expected in ((30.0, False), (1.0, True)):
-        found, certain = sought(apart)
-        assert np.allclose(found, poses[0]) and certain == expected
-        # where errors are not certain, what others show decides
-        found, certain = sought(apart, lambda view, some: np.eye(len(some))[7])
-        assert np.allclose(found, poses[0] if expected else module.all_turns(tried[0], axis)[7]) and certain == expected
+        return evidence
+
+    for elsewhere, certain in ((80.0, False), (20.0, True)):
+        found, sure = sought_again(guide, guide, poses[0], model, 1.0, None, axis=axis, alike=alike(elsewhere))
+        assert rotation_angle(found[:3, :3].T @ poses[0][:3, :3]) < 0.5 and sure == certain
+    found, sure = sought_again(guide, guide, poses[0], model, 1.0, None, axis=axis)
+    assert np.array_equal(found, tried[0]) and not sure
     monkeypatch.setattr(module, "overlaps", lambda view, some, model: np.full(len(some), 0.5))
-    assert sought(1.0) == (None, False)
+    assert sought_again(guide, guide, poses[0], model, 1.0, None, axis=axis) == (None, False)
 
 
 def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):

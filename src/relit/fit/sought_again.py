@@ -35,7 +35,8 @@ APART = 12.0
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
 OUTLINE = 0.95  # overlap of silhouettes from which on a place of a body of revolution is right up to a turn about the axis
-TURNS = 24  # about an axis that is known
+TURNS, FINE_TURNS = 24, 120  # about an axis that is known: of those that descend, and of those that are compared as they are
+SOME = 10.0  # evidence that any turn may have by chance
 ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
 
@@ -59,8 +60,8 @@ def sought_again(
     `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
     about the object's y axis: all turns are tried, and the best is taken, certain or not. axis: of an object that is a body of revolution,
     handles aside, whose silhouette tells all but the turn about it: where nothing is certain the best place whose silhouette agrees is
-    taken, and all turns are tried there; if none is certain either, the one by which the view shows what others show (`alike`: (K,) of a
-    view at poses (K, 4, 4), as `texture_shifts.agreement`).
+    taken, turned so that the view shows what the others show. alike: (K,) how much it does, of a view at poses (K, 4, 4), as
+    `texture_shifts.agreement`.
     """
     distance, tried = float(np.linalg.norm(guide_pose[:3, 3])), []
     for turn in range(ROUNDS if on_axis is None else 1):
@@ -81,15 +82,18 @@ def sought_again(
     if not np.isfinite(errors).any():
         return None, False
     pose, _ = likeliest(poses, errors, level)
-    poses, errors = descended(view, guide, guide_pose, all_turns(pose, axis), model, turns, seed)
-    errors = where_outlines_agree(errors, view, poses, model)
-    if not np.isfinite(errors).any():
-        return pose, False
-    pose, certain = likeliest(poses, errors, level)
-    if not certain and alike is not None:
-        poses = poses[np.isfinite(errors)]
-        pose = poses[np.argmax(alike(view, poses))]
-    return pose, certain
+    return (pose, False) if alike is None else turned_alike(view, pose, axis, alike)
+
+
+def turned_alike(view: View, pose: np.ndarray, axis: Axis, alike: Callable[[View, np.ndarray], np.ndarray]) -> tuple[np.ndarray, bool]:
+    """(the pose with the object turned about its axis so that the view shows what others show, is that certain). The peak is a few degrees
+    wide, where poses are exact, and then hardly to be mistaken."""
+    evidence = alike(view, all_turns(pose, axis, FINE_TURNS))
+    best, step = int(evidence.argmax()), 2 * np.pi / FINE_TURNS
+    away = np.abs((np.arange(FINE_TURNS) - best + FINE_TURNS // 2) % FINE_TURNS - FINE_TURNS // 2) * np.degrees(step) > ANOTHER
+    near = np.array([turned_by(pose, axis, (best + part) * step) for part in np.linspace(-0.75, 0.75, 7)])
+    closer = alike(view, near)
+    return near[closer.argmax()], bool(closer.max() >= CLEARLY * max(evidence[away].max(), SOME))
 
 
 def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.ndarray, bool]:
@@ -114,10 +118,15 @@ def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
     return (drawn & own & known).sum((1, 2)) / np.maximum(((drawn | own) & known).sum((1, 2)), 1)
 
 
-def all_turns(pose: np.ndarray, axis: Axis) -> np.ndarray:
-    """(TURNS, 4, 4): the pose with the object turned about its axis."""
-    about = [exp_so3(a * axis.direction) for a in np.arange(TURNS) * 2 * np.pi / TURNS]
-    return np.array([similarity(r, axis.point - r @ axis.point) @ pose for r in about])
+def all_turns(pose: np.ndarray, axis: Axis, count: int = TURNS) -> np.ndarray:
+    """(count, 4, 4): the pose with the object turned about its axis."""
+    return np.array([turned_by(pose, axis, a) for a in np.arange(count) * 2 * np.pi / count])
+
+
+def turned_by(pose: np.ndarray, axis: Axis, angle: float) -> np.ndarray:
+    """The pose with the object turned about an axis, by radians."""
+    turn = exp_so3(angle * axis.direction)
+    return similarity(turn, axis.point - turn @ axis.point) @ pose
 
 
 def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:
