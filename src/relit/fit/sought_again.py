@@ -58,11 +58,10 @@ def sought_again(
 
     guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
     `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
-    about the object's y axis: all turns are tried, and the best is taken, or where it is not certain and the object is one of revolution
-    it is turned as told below. axis: of an object that is a body of revolution,
+    about the object's y axis: all turns are tried, and the best is taken, certain or not. axis: of an object that is a body of revolution,
     handles aside, whose silhouette tells all but the turn about it: where nothing is certain the best place whose silhouette agrees is
-    taken, turned so that the view shows what the others show. alike: (K,) how much it does, of a view at poses (K, 4, 4), as
-    `texture_shifts.agreement`.
+    taken. Both are then turned about it so that the view shows what the others show, which `alike` tells, (K,) of a view at poses
+    (K, 4, 4), as `texture_shifts.agreement` does.
     """
     distance, tried = float(np.linalg.norm(guide_pose[:3, 3])), []
     for turn in range(ROUNDS if on_axis is None else 1):
