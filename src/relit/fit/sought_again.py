@@ -36,7 +36,6 @@ AGREES = 8.0  # times the median error of the others at most: paint that this in
 CLEARLY = 2.0  # times as much it is at any other place
 OUTLINE = 0.95  # overlap of silhouettes from which on a place of a body of revolution is right up to a turn about the axis
 TURNS, FINE_TURNS = 24, 120  # about an axis that is known: of those that descend, and of those that are compared as they are
-SOME = 10.0  # evidence that any turn may have by chance
 ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
 
@@ -73,7 +72,7 @@ def sought_again(
         if certain:
             return pose, True
         if on_axis is not None:
-            return (pose, False) if axis is None or alike is None else turned_alike(view, pose, axis, alike)
+            return pose if axis is None or alike is None else turned_alike(view, pose, axis, alike), False
         tried.append((poses, errors))
         if np.nanmin(errors) <= AGREES * level:
             break
@@ -84,18 +83,15 @@ def sought_again(
     if not np.isfinite(errors).any():
         return None, False
     pose, _ = likeliest(poses, errors, level)
-    return (pose, False) if alike is None else turned_alike(view, pose, axis, alike)
+    return pose if alike is None else turned_alike(view, pose, axis, alike), False
 
 
-def turned_alike(view: View, pose: np.ndarray, axis: Axis, alike: Callable[[View, np.ndarray], np.ndarray]) -> tuple[np.ndarray, bool]:
-    """(the pose with the object turned about its axis so that the view shows what others show, is that certain). The peak is a few degrees
-    wide, where poses are exact, and then hardly to be mistaken."""
-    evidence = alike(view, all_turns(pose, axis, FINE_TURNS))
-    best, step = int(evidence.argmax()), 2 * np.pi / FINE_TURNS
-    away = np.abs((np.arange(FINE_TURNS) - best + FINE_TURNS // 2) % FINE_TURNS - FINE_TURNS // 2) * np.degrees(step) > ANOTHER
-    near = np.array([turned_by(pose, axis, (best + part) * step) for part in np.linspace(-0.75, 0.75, 7)])
-    closer = alike(view, near)
-    return near[closer.argmax()], bool(closer.max() >= CLEARLY * max(evidence[away].max(), SOME))
+def turned_alike(view: View, pose: np.ndarray, axis: Axis, alike: Callable[[View, np.ndarray], np.ndarray]) -> np.ndarray:
+    """The pose with the object turned about its axis so that the view shows what others show. The peak is a few degrees wide; it is a guess
+    even where it leads clearly, for by a pose that is not exact half a turn of a pattern that repeats can look more alike than its own."""
+    best = int(alike(view, all_turns(pose, axis, FINE_TURNS)).argmax())
+    near = np.array([turned_by(pose, axis, (best + part) * 2 * np.pi / FINE_TURNS) for part in np.linspace(-0.75, 0.75, 7)])
+    return near[alike(view, near).argmax()]
 
 
 def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.ndarray, bool]:
