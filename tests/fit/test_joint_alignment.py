@@ -8,6 +8,7 @@ import trimesh
 
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import linear_from_srgb, move_points, srgb_from_linear
+from relit.fit import joint_alignment
 from relit.fit.joint_alignment import (
     EXACT,
     follow_views,
@@ -124,19 +125,19 @@ def test_pictures_lie_on_each_other_where_all_is_right(seen):
 def test_a_pose_is_asked_back_by_the_pixels_that_it_is_off(seen):
     """The shift is what the projection by the true pose says, in size and in sign, and so in both places of a pair."""
     mesh, cameras, pictures, masks = seen
-    wrong = [astray(cameras[:1], 2.0, seed=4)[0], *cameras[1:]]
+    wrong = [astray(cameras[:1], 2.4, seed=4)[0], *cameras[1:]]
     shifts = texture_shifts(mesh, wrong, pictures, masks)
     mine = [s for s in shifts if s.view == 0]
     asked = np.concatenate([(cameras[0].project(s.point) - wrong[0].project(s.point))[:, :2] for s in mine])
     told = np.concatenate([s.shift for s in mine])
-    assert len(mine) >= 4 and np.linalg.norm(asked, axis=1).mean() > 1.3
+    assert len(mine) >= 4 and np.linalg.norm(asked, axis=1).mean() > 1.5
     assert np.corrcoef(asked.ravel(), told.ravel())[0, 1] > 0.85
     assert 0.5 < (told * asked).sum() / (asked * asked).sum() < 1.1  # flow shrinks: rounds make up for it
     placed = wrong
     for _ in range(4):
         _, placed = solved(mesh, placed, texture_rows(texture_shifts(mesh, placed, pictures, masks), placed), still=True)
     off = [rotation_angle(p.world_from_camera[:3, :3].T @ c.world_from_camera[:3, :3]) for p, c in zip(placed, cameras, strict=True)]
-    assert max(off) < 0.6, "the one that was turned by 2 degrees is back, the others stay"
+    assert max(off) < 0.6, "the one that was turned by 2.4 degrees is back, the others stay"
 
 
 def test_a_mesh_that_is_too_thin_is_told_by_parallax(seen):
@@ -193,6 +194,24 @@ def test_without_texture_outlines_are_followed_alone(seen):
     _, poses, said = follow_views(mesh, cameras, plain, masks, everywhere(masks), 2)
     np.testing.assert_array_equal(poses, follow_with_poses(mesh, cameras, masks, everywhere(masks), 2)[1])
     assert said == ""
+
+
+@pytest.mark.parametrize("left", [1, 3])
+def test_where_textures_cease_to_tell_outlines_are_followed_alone(seen, monkeypatch, left):
+    """After one look at them, or in the midst of the rounds, no pair shares enough."""
+    mesh, cameras, pictures, masks = seen
+    ways = [(3, 0), (-2, 2), (0, -3), (-3, 1), (2, 2), (1, -3)]
+    wrong = [np.roll(m, (dy, dx), (0, 1)) for m, (dx, dy) in zip(masks, ways, strict=True)]
+    looks = []
+
+    def looked(*given):
+        looks.append(1)
+        return texture_shifts(*given) if len(looks) <= left else []
+
+    monkeypatch.setattr(joint_alignment, "texture_shifts", looked)
+    _, poses, said = follow_views(mesh, cameras, pictures, wrong, everywhere(masks), 2)
+    np.testing.assert_array_equal(poses, follow_with_poses(mesh, cameras, wrong, everywhere(masks), 2)[1])
+    assert said == "" and len(looks) > left
 
 
 def test_colour_tells_where_brightness_does_not(seen):

@@ -106,7 +106,10 @@ def by_both(mesh: Mesh, placed: list[Camera], pictures, masks, known, rounds: in
     outlines then count however far they are off."""
     spread = 0.0
     for _ in range(rounds):
-        rows, before = texture_rows(texture_shifts(mesh, placed, pictures, masks), placed), placed
+        shifts, before = texture_shifts(mesh, placed, pictures, masks), placed
+        if not shifts:
+            break
+        rows = texture_rows(shifts, placed)
         outlines, spread = outline_rows(mesh, placed, masks, known, max(spread, LABELS) if softer else 0.0)
         mesh, placed = solved(mesh, placed, rows + outlines, stiffness=softer or (STIFF, REST))
         if settled(before, placed):

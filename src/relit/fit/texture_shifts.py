@@ -186,8 +186,8 @@ def channels_of(picture: np.ndarray, tint: np.ndarray) -> np.ndarray:
     """(h, w, 3) of a picture (h, w, 3): its brightness as displays show it, and the shares of red and blue against a tint (3,), which
     shading and what is mirrored in the object's own colour leave alone."""
     solid = np.maximum(picture, 0) / np.maximum(tint, 1e-4)
-    shares = solid[..., [0, 2]] / (solid.sum(-1, keepdims=True) + DIM)
-    return np.concatenate([brightness(picture)[..., None], shares], -1).astype(np.float32)
+    red_and_blue = solid[..., [0, 2]] / (solid.sum(-1, keepdims=True) + DIM)
+    return np.concatenate([brightness(picture)[..., None], red_and_blue], -1).astype(np.float32)
 
 
 def brightness(picture: np.ndarray) -> np.ndarray:
