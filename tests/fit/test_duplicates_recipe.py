@@ -233,26 +233,28 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     """Who is left out of one pass is not in the next; at most PASSES are made. Poses that textures had to lead back are to stay then."""
     asked = []
 
-    def stage(views, poses, name, number, run, options, seed, symmetry):
-        asked.append((name, list(views)))
-        assert symmetry == (number or None)  # that of the pass before
-        odd = np.array([v == "b" for v in views])
-        return poses + np.where(odd, 0, 1)[:, None, None], odd, number < agree, 2.0 if number < arrives else 0.1, number + 1
+    def passes(*told: tuple[float, float | None]):
+        """(poses, odd, arrived, symmetry), asked for passes which turn the instances by so many degrees, and leave textures so far off."""
+        asked.clear()
 
-    monkeypatch.setattr(shape, "joint_stage", stage)
+        def stage(views, poses, number, run, options, seed, last):
+            asked.append(list(views))
+            assert (last and last.symmetry) == (number or None)  # that of the pass before
+            odd = np.array([v == "b" for v in views])
+            return shape.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, *told[number], number + 1)
+
+        monkeypatch.setattr(shape, "joint_stage", stage)
+        return shape.joint_stages(["a", "b", "c"], start, None, None, 0)
+
     start = np.zeros((3, 4, 4))
-    arrives, agree = 2, 99
-    poses, odd, arrived, symmetry = shape.joint_stages(["a", "b", "c"], start, None, None, 0)
-    assert [name for name, _ in asked] == ["joint", "joint_2", "joint_3"]
-    assert [some for _, some in asked] == [["a", "b", "c"], ["a", "c"], ["a", "c"]]
+    poses, odd, arrived, symmetry = passes((2, 3.0), (2, 2.0), (0.1, 1.5))
+    assert asked == [["a", "b", "c"], ["a", "c"], ["a", "c"]]
     assert odd.tolist() == [False, True, False] and poses[:, 0, 0].tolist() == [3, 0, 3] and not start.any()
     assert arrived and symmetry == 3
-    asked.clear()
-    arrives, agree = 99, 1
-    assert not shape.joint_stages(["a", "b", "c"], start, None, None, 0)[2] and len(asked) == 2, "labels and textures agree"
-    asked.clear()
-    agree = 99
-    assert not shape.joint_stages(["a", "b", "c"], start, None, None, 0)[2] and len(asked) == shape.PASSES, "still on their way"
+    assert not passes((2, 3.0), (2, None))[2] and len(asked) == 2, "labels and textures agree"
+    assert passes((2, 3.0), (2, 0.2))[2] and len(asked) == 2, "textures lie on one another"
+    assert passes((2, 0.6), (2, 0.55))[2] and len(asked) == 2, "textures come no closer"
+    assert not passes((2, 3.0), (2, 2.0), (2, 1.0), (2, 0.5))[2] and len(asked) == shape.PASSES, "still on their way"
 
 
 def test_two_photos_of_one_pile(tmp_path, monkeypatch):

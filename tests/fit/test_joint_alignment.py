@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
+from painted_lump import astray, camera_at, everywhere, lump, shown
 
-from relit.cameras.se3 import exp_so3, rotation_angle
+from relit.cameras.se3 import rotation_angle
 from relit.conventions import linear_from_srgb, move_points, srgb_from_linear
 from relit.fit import joint_alignment
 from relit.fit.joint_alignment import (
@@ -21,53 +21,8 @@ from relit.fit.joint_alignment import (
     with_poses,
 )
 from relit.fit.outlines import follow_with_poses, trace
-from relit.fit.texture_shifts import agreement, brightness, neighbours, shares, shown_by, texture_shifts
+from relit.fit.texture_shifts import brightness, neighbours, shares, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
-from relit.scene import Camera, Mesh
-
-SIZE, FOCAL = 160, 400.0
-
-
-def lump() -> Mesh:
-    """An egg with bumps: its outlines tell poses, its surface is not a sphere's."""
-    shape = trimesh.creation.icosphere(4, 1.0)
-    v = np.asarray(shape.vertices)
-    radius = 0.45 * (1 + 0.15 * np.sin(3 * v[:, :1] + 1) * np.cos(4 * v[:, 1:2]) + 0.1 * np.sin(5 * v[:, 2:]))
-    v = v * radius * [1.25, 0.85, 1.0]
-    made = trimesh.Trimesh(v, shape.faces, process=False)
-    return Mesh(v.astype(np.float32), np.asarray(shape.faces, np.int32), np.asarray(made.vertex_normals, np.float32))
-
-
-def colours(points: np.ndarray) -> np.ndarray:
-    """A pattern without edges, in the object's frame."""
-    waves = np.random.default_rng(3).normal(size=(12, 3)) * 14
-    values = np.sin(points @ waves.T + np.arange(12))
-    return 0.5 + 0.12 * values.reshape(*points.shape[:-1], 3, 4).sum(-1)
-
-
-def camera_at(direction, turn) -> Camera:
-    z = -np.asarray(direction, float) / np.linalg.norm(direction)
-    x = np.cross(z, [0.3, 0.9, 0.1])
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], 1) @ exp_so3([0, 0, turn]), -3 * z
-    return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
-
-
-def shown(mesh: Mesh, cameras: list[Camera]):
-    """(pictures, masks) of the mesh, each under another light."""
-    scene = build_geometry(mesh)
-    pictures, masks = [], []
-    part = (np.arange(4) + 0.5) / 4
-    y, x = np.mgrid[:SIZE, :SIZE]
-    at = np.broadcast_arrays(x[..., None, None] + part, y[..., None, None] + part[:, None])
-    for k, camera in enumerate(cameras):
-        seen = shown_by(mesh, scene, camera, np.ones((SIZE, SIZE), np.float32))
-        brightness = 0.6 + 0.3 * np.sin(0.02 * x + k)[..., None]
-        pictures.append(np.where(seen.hit[..., None], brightness * colours(seen.point), 0.1).astype(np.float32))
-        hit = np.isfinite(trace(scene, camera, at[0].ravel(), at[1].ravel())[0])
-        masks.append(hit.reshape(SIZE, SIZE, 16).mean(-1).astype(np.float32))
-    return pictures, masks
 
 
 @pytest.fixture(scope="module")
@@ -79,12 +34,6 @@ def seen():
     return mesh, cameras, *shown(mesh, cameras)
 
 
-def astray(cameras, degrees, seed=0) -> list[Camera]:
-    turns = np.random.default_rng(seed).normal(size=(len(cameras), 3))
-    turns *= np.radians(degrees) / np.linalg.norm(turns, axis=1, keepdims=True)
-    return [turned(c, np.append(t, np.zeros(3))) for c, t in zip(cameras, turns, strict=True)]
-
-
 def apart(poses, cameras, mesh) -> float:
     """Pixels by which a place of the surface that one view truly sees is missed when another shows it, by these poses, root mean square
     over all pairs."""
@@ -93,10 +42,6 @@ def apart(poses, cameras, mesh) -> float:
     found = [c.with_pose(p) for p, c in zip(poses, cameras, strict=True)]
     missed = [(f.project(x) - c.project(points))[:, :2] for n, (f, c) in enumerate(zip(found, cameras, strict=True)) for x in placed[:n]]
     return float(np.sqrt(np.square(missed).sum(-1).mean()))
-
-
-def everywhere(masks) -> list[np.ndarray]:
-    return [np.ones_like(m) for m in masks]
 
 
 def test_derivatives_are_those_of_the_projection(seen):
@@ -168,11 +113,11 @@ def test_a_mesh_that_is_too_thin_is_told_by_parallax(seen):
 def test_exact_labels_are_believed_alone(seen):
     mesh, cameras, pictures, masks = seen
     wrong = astray(cameras, 1.0)
-    found, poses, said = follow_views(mesh, wrong, pictures, masks, everywhere(masks), 5)
+    found, poses, off = follow_views(mesh, wrong, pictures, masks, everywhere(masks), 5)
     expected, alone = follow_with_poses(mesh, wrong, masks, everywhere(masks), 5)
     np.testing.assert_array_equal(poses, alone)
     np.testing.assert_array_equal(found.vertices, expected.vertices)
-    assert said == "" and apart(poses, cameras, mesh) < 0.5
+    assert off is None and apart(poses, cameras, mesh) < 0.5
 
 
 def test_labels_that_mislead_are_outvoted_by_textures(seen):
@@ -181,9 +126,9 @@ def test_labels_that_mislead_are_outvoted_by_textures(seen):
     ways = [(3, 0), (-2, 2), (0, -3), (-3, 1), (2, 2), (1, -3)]
     wrong = [np.roll(m, (dy, dx), (0, 1)) for m, (dx, dy) in zip(masks, ways, strict=True)]
     _, alone = follow_with_poses(mesh, cameras, wrong, everywhere(masks), 5)
-    found, poses, said = follow_views(mesh, cameras, pictures, wrong, everywhere(masks), 5)
+    found, poses, off = follow_views(mesh, cameras, pictures, wrong, everywhere(masks), 5)
     assert misfit(texture_shifts(mesh, with_poses(cameras, alone), pictures, wrong)) > EXACT
-    assert misfit(texture_shifts(found, with_poses(cameras, poses), pictures, wrong)) < EXACT and "textures" in said
+    assert misfit(texture_shifts(found, with_poses(cameras, poses), pictures, wrong)) < EXACT and off[1] < EXACT < off[0]
     assert apart(poses, cameras, mesh) < 0.5 * apart(alone, cameras, mesh)
 
 
@@ -191,9 +136,9 @@ def test_without_texture_outlines_are_followed_alone(seen):
     mesh, cameras, pictures, masks = seen
     plain = [np.full_like(p, 0.5) for p in pictures]
     assert texture_shifts(mesh, cameras, plain, masks) == []
-    _, poses, said = follow_views(mesh, cameras, plain, masks, everywhere(masks), 2)
+    _, poses, off = follow_views(mesh, cameras, plain, masks, everywhere(masks), 2)
     np.testing.assert_array_equal(poses, follow_with_poses(mesh, cameras, masks, everywhere(masks), 2)[1])
-    assert said == ""
+    assert off is None
 
 
 @pytest.mark.parametrize("left", [1, 3])
@@ -209,9 +154,9 @@ def test_where_textures_cease_to_tell_outlines_are_followed_alone(seen, monkeypa
         return texture_shifts(*given) if len(looks) <= left else []
 
     monkeypatch.setattr(joint_alignment, "texture_shifts", looked)
-    _, poses, said = follow_views(mesh, cameras, pictures, wrong, everywhere(masks), 2)
+    _, poses, off = follow_views(mesh, cameras, pictures, wrong, everywhere(masks), 2)
     np.testing.assert_array_equal(poses, follow_with_poses(mesh, cameras, wrong, everywhere(masks), 2)[1])
-    assert said == "" and len(looks) > left
+    assert off is None and len(looks) > left
 
 
 def test_colour_tells_where_brightness_does_not(seen):
@@ -240,19 +185,6 @@ def test_places_count_by_their_structure(seen):
     (share,) = shares([some])
     assert share[clear].min() > 50 * share[~clear].max() and np.average(share, weights=share) == pytest.approx(1.0)
     assert misfit([some]) == 1.0
-
-
-def test_the_right_pose_of_a_view_shows_what_the_others_show(seen):
-    """Of poses turned by up to 40 degrees about the line of sight of nobody; each view has its own light."""
-    mesh, cameras, pictures, masks = seen
-    own, up = np.asarray(cameras[0].world_from_camera), [0.2, 0.9, 0.3] / np.linalg.norm([0.2, 0.9, 0.3])
-    poses = []
-    for degrees in (-40, -20, -6, 0, 6, 20, 40):
-        turn = np.eye(4)
-        turn[:3, :3] = exp_so3(np.radians(degrees) * up)
-        poses.append(turn @ own)
-    told = agreement(mesh, cameras[1:], pictures[1:], masks[1:], cameras[0], pictures[0], masks[0], np.array(poses))
-    assert told.argmax() == 3 and told[3] > 3 * max(told[0], told[1], told[5], told[6], 0)
 
 
 def test_a_shape_that_is_wrong_bends_until_textures_agree():

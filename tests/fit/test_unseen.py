@@ -99,8 +99,10 @@ def test_what_another_instance_hides_of_all_counts_as_unseen():
     pile = Mesh(vertices, np.concatenate([one.faces, one.faces + n, ground]), normals, uvs)
     front = cameras()[0].with_pose(look_at(np.array([0.0, 0.0, 2.1])))
     middle = one.vertices[one.faces].mean(1)[:, 2]
-    seen = shown_faces(pile, 2, [front])
+    both = np.array([True, True])
+    seen = shown_faces(pile, both, [front])
     assert seen.shape == (len(one.faces),)
     assert seen[middle > 0.3].all() and not seen[middle < 0.1].any()
     back = cameras()[0].with_pose(look_at(np.array([0.0, 0.0, -4.1]), np.array([0.0, 0.0, -2.0])))
-    assert shown_faces(pile, 2, [front, back])[middle < -0.3].all()  # which the far one shows
+    assert shown_faces(pile, both, [front, back])[middle < -0.3].all()  # which the far one shows
+    assert not shown_faces(pile, np.array([True, False]), [front, back])[middle < 0.1].any()  # but not where its turn is a guess

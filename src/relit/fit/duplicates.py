@@ -124,7 +124,9 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         fit_surface(bank, traced, model, o, stage, seed, gathered)
         names = ("base_color", "roughness", "metallic")
         paint = {n: fill_gutters(t, known) for n, t in zip(names, pictures(model.material), strict=True)}
-        paint = painted_over(mesh, shown_faces(lit.pile, len(parts["poses"]), lit.cameras), paint, face, bary)
+        told = parts["view_instances"][~np.isin(parts["view_keys"], parts.get("vague", ()))]  # who is turned by guess paints nothing
+        which = np.isin(np.arange(len(parts["poses"])), told)
+        paint = painted_over(mesh, shown_faces(lit.pile, which, lit.cameras), paint, face, bary)
         environment = model.environment.image()
         ground = ground_level
         if up is not None:
@@ -140,11 +142,11 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
     return maps
 
 
-def shown_faces(pile: Mesh, count: int, cameras: list[Camera]) -> np.ndarray:
-    """(F,) bool: faces of the object that some camera sees on one of the `count` instances, which come first in the pile."""
+def shown_faces(pile: Mesh, which: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+    """(F,) bool: faces of the object that some camera sees on one of the instances `which` (K,) bool. All K come first in the pile."""
     seen = seen_faces(pile, cameras)
     instances = (pile.uvs[pile.faces[:, 0], 0] > NO_TEXELS).sum()
-    return seen[:instances].reshape(count, -1).any(0)
+    return seen[:instances].reshape(len(which), -1)[which].any(0)
 
 
 # ---------------------------------------------------------------- asset

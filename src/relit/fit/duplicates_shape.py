@@ -4,6 +4,7 @@ found again, the mesh, and the ground that they stand on. For the recipe `duplic
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import mitsuba as mi
@@ -25,7 +26,7 @@ from relit.fit.pile_photos import Scene, gather
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
 from relit.fit.sought_again import sought_again
-from relit.fit.texture_shifts import agreement
+from relit.fit.turn_guess import others_of, turned_alike
 from relit.fit.vessel_trial import vessel_of
 from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
@@ -42,6 +43,7 @@ HOLD_OPENED = 100  # the same of a pass that begins with the shape of the one be
 PASSES, ORDINALS = 4, ("first", "second", "third", "fourth")  # volume passes for the poses alone, at most
 JOINT = ("joint", *(f"joint_{k}" for k in range(2, PASSES + 1)))  # their stages
 ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last one
+CLOSE, CLOSER = 0.25, 0.8  # so was one that leaves textures within these pixels, or within so much of what the one before left
 
 
 def shape_stages(
@@ -118,62 +120,87 @@ def parts_of(mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndar
     }
 
 
-def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, bool]:
-    """(mesh, poses, do textures have a part in it) as outlines, and where these are not exact textures too, have them."""
+def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, float | None]:
+    """(mesh, poses, off) as outlines, and where these are not exact textures too, have them. off: pixels by which textures do not lie on
+    one another then (median); None where they have no part in it."""
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
     pictures, masks, known = zip(*((v.rgb, v.mask, v.known) for v in views), strict=True)
     if "textures" in options.without:
-        return *follow_with_poses(mesh, cameras, masks, known, options.outlines), False
-    mesh, poses, said = follow_views(mesh, cameras, pictures, masks, known, options.outlines)
-    if said:
-        run.say(said)
-    return mesh, poses, bool(said)
+        return *follow_with_poses(mesh, cameras, masks, known, options.outlines), None
+    mesh, poses, off = follow_views(mesh, cameras, pictures, masks, known, options.outlines)
+    if off is None:
+        return mesh, poses, None
+    before, after = off
+    run.say(
+        f"poses that follow the labels alone leave textures {before:.1f} pixels off (median): they follow both now ({after:.1f} pixels)"
+    )
+    return mesh, poses, after
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What a volume pass for the poses alone gives. poses: (N, 4, 4). odd: (N,) bool, who shows what does not agree with the model of all.
+    turn: degrees by which it has turned the instances, the median. off: pixels, see `followed`. symmetry: of its shape; None where that is
+    not even."""
+
+    poses: np.ndarray
+    odd: np.ndarray
+    turn: float
+    off: float | None
+    symmetry: Symmetry | None
+
+    def arrived(self, last: Pass | None) -> bool:
+        """Whether another one would only lead the poses away again: textures brought them back to where they had been before, or as close
+        together as flow can tell, or hardly closer than in the pass before."""
+        if self.off is None:
+            return False
+        settled = last is not None and last.off is not None and self.off > CLOSER * last.off
+        return settled or self.turn < ARRIVED or self.off < CLOSE
 
 
 def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool, arrived, symmetry or None) after a first volume pass, and others while textures say that poses are still on
-    their way (at most PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with the
-    model of all. A shape that grew up with better poses is sharper, and moves them on. arrived: textures brought the poses back to
-    where they had been before the last pass, and another one would only lead them away again."""
-    poses, odd, arrived, symmetry = poses.copy(), np.zeros(len(views), bool), False, None
+    """(poses, odd (N,) bool, arrived: see `Pass`, symmetry or None) after a first volume pass, and others while textures say that poses are
+    still on their way (at most PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with
+    the model of all. A shape that grew up with better poses is sharper, and moves them on."""
+    poses, odd, last, arrived = poses.copy(), np.zeros(len(views), bool), None, False
     for number in range(PASSES):
         rest = np.flatnonzero(~odd)
-        name = JOINT[number]
-        some = [views[k] for k in rest]
-        poses[rest], odd[rest], disagree, turn, symmetry = joint_stage(some, poses[rest], name, number, run, options, seed, symmetry)
-        arrived = disagree and turn < ARRIVED
-        if arrived or not disagree:
+        one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last)
+        poses[rest], odd[rest] = one.poses, one.odd
+        last, arrived = one, one.arrived(last)
+        if arrived or one.off is None:
             break
-    return poses, odd, arrived, symmetry
+    return poses, odd, arrived, last.symmetry
 
 
-def joint_stage(
-    views: list[View], poses: np.ndarray, name: str, number: int, run, options: DuplicatesOptions, seed: int, symmetry: Symmetry | None
-):
-    """(poses, odd (N,) bool, disagree, turn, symmetry) after one such pass. Textures are asked here already: what the pass has built in the
-    wrong place it does not take back. disagree: they did not agree with poses that follow the labels alone. turn: degrees by which the
-    pass has turned the instances, the median. symmetry: of the shape of the pass before, and of this one's; None where it is not
-    even."""
+def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, last: Pass | None) -> Pass:
+    """One such pass, after `last`. Textures are asked here already: what the pass has built in the wrong place it does not take back. Where
+    they have led the last one's poses, these stay while the shape is built: labels alone have misled them."""
+    name = JOINT[number]
     if run.done(name):
         saved = run_arrays(run, name, "joint")
-        return saved["poses"], saved["odd"], bool(saved.get("disagree", False)), float(saved.get("turn", 0)), symmetry_from(saved)
+        off = float(saved["off"]) if "off" in saved else None
+        return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved))
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
-        before, disagree = poses, False
-        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry)
+        before, off, symmetry = poses, None, last and last.symmetry
+        still = last is not None and last.off is not None
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still)
+        poses = poses.copy()
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         if "textures" not in options.without:
-            better, moved, disagree = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
-            mesh, poses[~odd] = (better, moved) if disagree else (mesh, poses[~odd])
+            better, moved, off = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
+            mesh, poses[~odd] = (mesh, poses[~odd]) if off is None else (better, moved)
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
         symmetry = None if "symmetry" in options.without else find_symmetry(mesh, views, poses)
         if number == 0 and symmetry is not None:
             run.say("the object is its own mirror image: its silhouettes bound it from both sides")
-        stage.save("joint", poses=poses, odd=odd, disagree=disagree, turn=turn, **(symmetry.arrays if symmetry else {}))
-    return poses, odd, disagree, turn, symmetry
+        kept = {} if off is None else {"off": off}
+        stage.save("joint", poses=poses, odd=odd, turn=turn, **kept, **(symmetry.arrays if symmetry else {}))
+    return Pass(poses, odd, turn, off, symmetry)
 
 
 def volume_stage(
@@ -186,7 +213,7 @@ def volume_stage(
     options: DuplicatesOptions,
     seed: int,
 ):
-    """(views, poses, model, arrived: see `joint_stages`, vague) after the volume pass, from the poses of the first ones. Instances that do
+    """(views, poses, model, arrived: see `Pass`, vague) after the volume pass, from the poses of the first ones. Instances that do
     not agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished model.
     vague: (view, pose) of those whose axis alone is told, by `on_axes` (see `shape_stages`) or by the silhouette in the model."""
     arrived, symmetry, vessel, vague = False, None, None, []
@@ -247,9 +274,10 @@ def with_found(
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
     mesh = extract_mesh(dense_values(model.grid))
     found, vague, axis = [], [], body_axis(mesh)
-    alike = partial(alike_by, mesh, views, poses)
+    shown = axis and others_of(mesh, views, poses)
+    turned = axis and ((lambda view, pose: turned_alike(shown, view, pose, axis)) if shown else (lambda _, pose: pose))
     for view in others:
-        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), axis, alike)
+        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), turned)
         if pose is not None and not sure:
             run.say(f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess")
         else:
@@ -259,12 +287,6 @@ def with_found(
     count = len(found) + len(vague)
     model.reflections = mi.Float(np.concatenate([np.array(model.reflections), np.zeros(4 * count, np.float32)]))
     return [*views, *(v for v, _ in found)], np.concatenate([poses, *(p[None] for _, p in found)]), vague
-
-
-def alike_by(mesh: Mesh, views: list[View], poses: np.ndarray, view: View, some: np.ndarray) -> np.ndarray:
-    """(K,) how much what a view shows is like what those of `views` show of the mesh, for each of its poses `some` (K, 4, 4)."""
-    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-    return agreement(mesh, cameras, [v.rgb for v in views], [v.mask for v in views], view.camera, view.rgb, view.mask * view.known, some)
 
 
 def pose_rate(views: list[View], options: DuplicatesOptions) -> float:

@@ -68,9 +68,11 @@ class Rows:
     trust: np.ndarray
 
 
-def follow_views(mesh: Mesh, cameras: list[Camera], pictures, masks, known, rounds: int) -> tuple[Mesh, np.ndarray, str]:
-    """(mesh, poses (N, 4, 4), what is to be said of it or "") as outlines have them, and where these contradict the textures as both
-    have them.
+def follow_views(
+    mesh: Mesh, cameras: list[Camera], pictures, masks, known, rounds: int
+) -> tuple[Mesh, np.ndarray, tuple[float, float] | None]:
+    """(mesh, poses (N, 4, 4), off) as outlines have them, and where these contradict the textures as both have them. off: pixels by which
+    textures do not lie on one another (median), as outlines alone have it and as both; None where textures have no part in it.
 
     mesh: welded, with normals. cameras: in its frame, whose origin the object is about. pictures: (h, w, 3) linear, masks, known: (h, w) of
     each view, see `outlines.follow_with_poses`. rounds: of outlines alone.
@@ -78,7 +80,7 @@ def follow_views(mesh: Mesh, cameras: list[Camera], pictures, masks, known, roun
     outlined, poses = follow_with_poses(mesh, cameras, masks, known, rounds)
     before = misfit(texture_shifts(outlined, with_poses(cameras, poses), pictures, masks))
     if before <= EXACT:
-        return outlined, poses, ""
+        return outlined, poses, None
     placed = by_textures(outlined, with_poses(cameras, poses), pictures, masks)
     if misfit(texture_shifts(outlined, placed, pictures, masks)) < SHARP:
         found, placed = by_both(outlined, placed, pictures, masks, known, BOTH)
@@ -86,9 +88,8 @@ def follow_views(mesh: Mesh, cameras: list[Camera], pictures, masks, known, roun
         found, placed = by_both(outlined, with_poses(cameras, poses), pictures, masks, known, SOFT, YIELDING)
     after = misfit(texture_shifts(found, placed, pictures, masks))
     if not 0 < after < before:
-        return outlined, poses, ""
-    said = f"poses that follow the labels alone leave textures {before:.1f} pixels off (median): they follow both now ({after:.1f} pixels)"
-    return found, np.array([c.world_from_camera for c in placed]), said
+        return outlined, poses, None
+    return found, np.array([c.world_from_camera for c in placed]), (before, after)
 
 
 def by_textures(mesh: Mesh, placed: list[Camera], pictures, masks) -> list[Camera]:
@@ -174,7 +175,7 @@ def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known, least: float =
     scene = build_geometry(mesh)
     found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
     shift = np.concatenate([o.shift for o in found])
-    spread = max(spread_of(shift), least)
+    spread = max(spread_of(shift) if len(shift) else 0.0, least)
     trust = precision(shift, spread, max(FAR, OUTLIER * spread) if least else FAR)
     trust = np.split(trust, np.cumsum([len(o.shift) for o in found])[:-1])
     out = []

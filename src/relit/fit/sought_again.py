@@ -14,8 +14,7 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
-from relit.cameras.se3 import exp_so3, rotation_angle
-from relit.conventions import similarity
+from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_growth import ANOTHER
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED
@@ -24,6 +23,7 @@ from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from, volume_render
 from relit.fit.revolution import UP
+from relit.fit.turn_guess import turned_by
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.geometry.revolution_axis import Axis
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
@@ -35,7 +35,7 @@ APART = 12.0
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
 OUTLINE = 0.95  # overlap of silhouettes from which on a place of a body of revolution is right up to a turn about the axis
-TURNS, FINE_TURNS = 24, 120  # about an axis that is known: of those that descend, and of those that are compared as they are
+TURNS = 24  # about an axis that is known
 ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
 
@@ -49,18 +49,16 @@ def sought_again(
     turns: Callable | None,
     seed: int = 0,
     on_axis: np.ndarray | None = None,
-    axis: Axis | None = None,
-    alike: Callable[[View, np.ndarray], np.ndarray] | None = None,
+    turned: Callable[[View, np.ndarray], np.ndarray] | None = None,
 ):
     """(pose (4, 4) of `view` in the model or None, is that certain): None where what it shows agrees with the model nowhere, or in several
     places.
 
     guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
     `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
-    about the object's y axis: all turns are tried, and the best is taken, certain or not. axis: of an object that is a body of revolution,
-    handles aside, whose silhouette tells all but the turn about it: where nothing is certain the best place whose silhouette agrees is
-    taken. Both are then turned about it so that the view shows what the others show, which `alike` tells, (K,) of a view at poses
-    (K, 4, 4), as `texture_shifts.agreement` does.
+    about the object's y axis: all turns are tried, and the best is taken, certain or not. turned: for an object that is a body of
+    revolution, handles aside, whose silhouette tells all but the turn about the axis: of a view and its pose (4, 4), the pose with which it
+    shows what the others show (`turn_guess.turned_alike`); where nothing is certain the best place whose silhouette agrees is taken then.
     """
     distance, tried = float(np.linalg.norm(guide_pose[:3, 3])), []
     for turn in range(ROUNDS if on_axis is None else 1):
@@ -72,26 +70,17 @@ def sought_again(
         if certain:
             return pose, True
         if on_axis is not None:
-            return pose if axis is None or alike is None else turned_alike(view, pose, axis, alike), False
+            return pose if turned is None else turned(view, pose), False
         tried.append((poses, errors))
         if np.nanmin(errors) <= AGREES * level:
             break
-    if axis is None or not tried:
+    if turned is None or not tried:
         return None, False
     poses, errors = (np.concatenate(part) for part in zip(*tried, strict=True))
     errors = where_outlines_agree(errors, view, poses, model)
     if not np.isfinite(errors).any():
         return None, False
-    pose, _ = likeliest(poses, errors, level)
-    return pose if alike is None else turned_alike(view, pose, axis, alike), False
-
-
-def turned_alike(view: View, pose: np.ndarray, axis: Axis, alike: Callable[[View, np.ndarray], np.ndarray]) -> np.ndarray:
-    """The pose with the object turned about its axis so that the view shows what others show. The peak is a few degrees wide; it is a guess
-    even where it leads clearly, for by a pose that is not exact half a turn of a pattern that repeats can look more alike than its own."""
-    best = int(alike(view, all_turns(pose, axis, FINE_TURNS)).argmax())
-    near = np.array([turned_by(pose, axis, (best + part) * 2 * np.pi / FINE_TURNS) for part in np.linspace(-0.75, 0.75, 7)])
-    return near[alike(view, near).argmax()]
+    return turned(view, likeliest(poses, errors, level)[0]), False
 
 
 def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.ndarray, bool]:
@@ -119,12 +108,6 @@ def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
 def all_turns(pose: np.ndarray, axis: Axis, count: int = TURNS) -> np.ndarray:
     """(count, 4, 4): the pose with the object turned about its axis."""
     return np.array([turned_by(pose, axis, a) for a in np.arange(count) * 2 * np.pi / count])
-
-
-def turned_by(pose: np.ndarray, axis: Axis, angle: float) -> np.ndarray:
-    """The pose with the object turned about an axis, by radians."""
-    turn = exp_so3(angle * axis.direction)
-    return similarity(turn, axis.point - turn @ axis.point) @ pose
 
 
 def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:

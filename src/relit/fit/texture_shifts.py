@@ -70,7 +70,7 @@ def texture_shifts(mesh: Mesh, cameras: list[Camera], pictures: list[np.ndarray]
     masks: (h, w). Pairs that share too little, or hardly any structure, are left out."""
     scene = build_geometry(mesh)
     shown = [shown_by(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
-    tint = np.mean([p[m > 0.5].mean(0) for p, m in zip(pictures, masks, strict=True)], 0)
+    tint = tint_of(pictures, masks)
     channels = [channels_of(p, tint) for p in pictures]
     return [one for i, j in neighbours(cameras) for one in shifts_of(mesh, scene, i, j, shown[i], cameras, channels, masks[j])]
 
@@ -87,11 +87,15 @@ def misfit(shifts: list[Shifts]) -> float:
 def shares(shifts: list[Shifts]) -> list[np.ndarray]:
     """What each place counts: flow is the surer, and the likelier right at all, the more structure there is. What most weight lies on
     counts 1."""
-    structure = [s.structure for s in shifts]
-    clear = np.quantile(np.concatenate(structure), CLEAR)
-    some = [np.minimum(s / clear, 1) ** 2 for s in structure]
+    clear = clear_of(shifts)
+    some = [np.minimum(s.structure / clear, 1) ** 2 for s in shifts]
     every = np.concatenate(some)
     return [s * every.sum() / (every**2).sum() for s in some]
+
+
+def clear_of(shifts: list[Shifts]) -> float:
+    """The structure from which on places count in full."""
+    return float(np.quantile(np.concatenate([s.structure for s in shifts]), CLEAR))
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
@@ -161,25 +165,9 @@ def brought_to(shown: Shown, picture: np.ndarray, x: np.ndarray, y: np.ndarray) 
     return brought
 
 
-def agreement(mesh: Mesh, cameras: list[Camera], pictures, masks, view: Camera, picture, mask, poses: np.ndarray) -> np.ndarray:
-    """(K,) evidence, for each of poses (K, 4, 4) of another view, that its picture (h, w, 3) shows the same pattern as those of the views
-    that look from the nearest sides: - n / 2 log(1 - ρ²) for each, ρ the correlation of their brightness, freed of what is local, and n
-    the patches that both show."""
-    scene, bright = build_geometry(mesh), [brightness(p) for p in pictures]
-    sides, own, out = np.array([c.centre / np.linalg.norm(c.centre) for c in cameras]), brightness(picture), []
-    for pose in poses:
-        camera, evidence = view.with_pose(pose), 0.0
-        shown = shown_by(mesh, scene, camera, mask)
-        for j in np.argsort(-sides @ camera.centre)[:NEIGHBOURS]:
-            both, x, y = met_by(scene, shown, cameras[j], masks[j])
-            if both.sum() < OVERLAP:
-                continue
-            inner = cv2.erode(both.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-            a, b = (contrasts(p, both)[inner] for p in (own, brought_to(shown, bright[j], x, y)))
-            rho = np.clip((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-6), -0.99, 0.99)
-            evidence -= np.sign(rho) * inner.sum() / (np.pi * PATCH**2) / 2 * np.log1p(-(rho**2))
-        out.append(evidence)
-    return np.array(out)
+def tint_of(pictures, masks) -> np.ndarray:
+    """(3,) mean colour of what pictures (h, w, 3) show inside their masks (h, w)."""
+    return np.mean([p[m > 0.5].mean(0) for p, m in zip(pictures, masks, strict=True)], 0)
 
 
 def channels_of(picture: np.ndarray, tint: np.ndarray) -> np.ndarray:
@@ -203,8 +191,27 @@ def contrasts(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
     return away / (np.sqrt(cv2.GaussianBlur(away**2, (0, 0), LOCAL) / share) + 0.02) * inside
 
 
+def around(picture: np.ndarray) -> np.ndarray:
+    """The mean over each pixel's PATCH."""
+    return cv2.GaussianBlur(picture, (0, 0), PATCH)
+
+
+def structure_of(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(h, w) of a picture of contrasts (h, w): the smaller eigenvalue of its structure tensor, 0 where that is little, and along the border
+    of `where`, (h, w) bool: what ends where both pictures do has not moved."""
+    right, down = (cv2.Sobel(picture, cv2.CV_32F, *axis) / 8 for axis in ((1, 0), (0, 1)))
+    xx, yy, xy = around(right**2), around(down**2), around(right * down)
+    structure = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    border = int(min(BORDER[0] * np.sqrt(where.sum()), BORDER[1]))
+    inner = cv2.erode(np.pad(where, 1).astype(np.uint8), np.ones((2 * border + 1, 2 * border + 1), np.uint8))[1:-1, 1:-1] > 0
+    return np.where(inner & (structure > STRUCTURE), structure, 0)
+
+
 def confirmed_flow(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(flow (h, w, 2) with a(x) = b(x + flow), structure (h, w) where it is to be believed, else 0) of two pictures of contrasts."""
+    structure = structure_of(a, where)
+    if np.count_nonzero(structure) < LEAST:
+        return np.zeros((*a.shape, 2), np.float32), np.zeros_like(structure)
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     grey = [np.clip(40 * p + 128, 0, 255).astype(np.uint8) for p in (a, b)]
     flow, back = dis.calc(*grey, None), dis.calc(*grey[::-1], None)
@@ -213,18 +220,9 @@ def confirmed_flow(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> tuple[np.
     def moved(picture):
         return cv2.remap(picture, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
 
-    def around(picture):
-        return cv2.GaussianBlur(picture, (0, 0), PATCH)
-
     returns = np.hypot(flow[..., 0] + moved(back[..., 0]), flow[..., 1] + moved(back[..., 1])) < BACK
     c = moved(b)
     spread = np.maximum((around(a * a) - around(a) ** 2) * (around(c * c) - around(c) ** 2), 1e-6)
     alike = (around(a * c) - around(a) * around(c)) / np.sqrt(spread) > ALIKE
-    right, down = (cv2.Sobel(a, cv2.CV_32F, *axis) / 8 for axis in ((1, 0), (0, 1)))
-    xx, yy, xy = around(right**2), around(down**2), around(right * down)
-    structure = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    border = int(min(BORDER[0] * np.sqrt(where.sum()), BORDER[1]))  # what ends where both pictures do has not moved
-    inner = cv2.erode(np.pad(where, 1).astype(np.uint8), np.ones((2 * border + 1, 2 * border + 1), np.uint8))[1:-1, 1:-1] > 0
     stays = moved(where.astype(np.float32)) > 0.99
-    good = inner & stays & returns & alike & (structure > STRUCTURE) & (np.hypot(*np.moveaxis(flow, -1, 0)) < FARTHEST)
-    return flow, np.where(good, structure, 0)
+    return flow, np.where(stays & returns & alike & (np.hypot(*np.moveaxis(flow, -1, 0)) < FARTHEST), structure, 0)
