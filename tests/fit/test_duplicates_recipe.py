@@ -23,6 +23,7 @@ from relit.fit import duplicates as recipe
 from relit.fit import duplicates_poses as poses_stage
 from relit.fit import duplicates_shape as shape
 from relit.fit import odd_instances as odd
+from relit.fit import pose_passes
 from relit.images import write_linear
 from relit.run import Run
 
@@ -160,7 +161,7 @@ def test_what_a_wrongly_placed_instance_shows_stands_out(pile, tmp_path):
     errors = []
     for some, name in ((poses, "right"), (wrong, "wrong")):
         with Run.open(tmp_path / name, {}) as run, run.stage("volume", steps=60, title="volume") as stage:
-            model, bank, _ = shape.shape_and_poses(views, some, run, stage, options, 0)
+            model, bank, _ = pose_passes.shape_and_poses(views, some, run, stage, options, 0)
             errors.append(odd.view_errors(bank, model))
     assert errors[0].max() < 1.3 * np.median(errors[0])
     assert errors[1][2] > 1.3 * np.delete(errors[1], 2).max()  # of four in a short fit, the others suffer too
@@ -170,7 +171,7 @@ def test_poses_wait_for_the_coarse_level_and_distances_move_on_the_middle_one(pi
     capture, options = open_capture(pile), small_options(levels=(16, 24, 32), level_steps=(6, 6, 6), rays=256)
     shots = [(p.load(), p.camera.with_pose(np.eye(4))) for p in capture.photos]
     views, poses = poses_stage.all_views(shots, options.side, options), true_poses(pile)
-    seen, fit = [], shape.fit_volume
+    seen, fit = [], pose_passes.fit_volume
 
     def watched(bank, model, o, stage, seed, begin_level):
         def begin(model):
@@ -180,10 +181,10 @@ def test_poses_wait_for_the_coarse_level_and_distances_move_on_the_middle_one(pi
         return fit(bank, model, o, stage, seed, begin)
 
     with Run.open(tmp_path / "still", {}) as run, run.stage("volume", steps=18, title="volume") as stage:
-        assert np.allclose(shape.shape_and_poses(views, poses, run, stage, options, 0, still=True)[2], poses, atol=1e-6)
-    monkeypatch.setattr(shape, "fit_volume", watched)
+        assert np.allclose(pose_passes.shape_and_poses(views, poses, run, stage, options, 0, still=True)[2], poses, atol=1e-6)
+    monkeypatch.setattr(pose_passes, "fit_volume", watched)
     with Run.open(tmp_path / "run", {}) as run, run.stage("volume", steps=18, title="volume") as stage:
-        _, bank, _ = shape.shape_and_poses(views, poses, run, stage, options, 0)
+        _, bank, _ = pose_passes.shape_and_poses(views, poses, run, stage, options, 0)
     last = np.array(bank.corrections).reshape(-1, 8)
     (coarse, rates), (middle, then) = seen
     assert not coarse.any() and middle[:, :3].any() and middle[:, 7].any()  # nothing moves on the coarse grid
@@ -213,7 +214,7 @@ def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
         calls.append(bank.views)
         return np.arange(bank.views) == 2
 
-    monkeypatch.setattr(shape, "odd_instances", third)
+    monkeypatch.setattr(pose_passes, "odd_instances", third)
     monkeypatch.setattr(shape, "sought_again", lambda *_: (None, False))
     capture, options = open_capture(pile), small_options(level_steps=(12,))
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
@@ -241,10 +242,10 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
             asked.append(list(views))
             assert (last and last.symmetry) == (number or None)  # that of the pass before
             odd = np.array([v == "b" for v in views])
-            return shape.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, *told[number], number + 1)
+            return pose_passes.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, *told[number], number + 1)
 
-        monkeypatch.setattr(shape, "joint_stage", stage)
-        return shape.joint_stages(["a", "b", "c"], start, None, None, 0)
+        monkeypatch.setattr(pose_passes, "joint_stage", stage)
+        return pose_passes.joint_stages(["a", "b", "c"], start, None, None, 0)
 
     start = np.zeros((3, 4, 4))
     poses, odd, arrived, symmetry = passes((2, 3.0), (2, 2.0), (0.1, 1.5))
@@ -254,7 +255,7 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     assert not passes((2, 3.0), (2, None))[2] and len(asked) == 2, "labels and textures agree"
     assert passes((2, 3.0), (2, 0.2))[2] and len(asked) == 2, "textures lie on one another"
     assert passes((2, 0.6), (2, 0.55))[2] and len(asked) == 2, "textures come no closer"
-    assert not passes((2, 3.0), (2, 2.0), (2, 1.0), (2, 0.5))[2] and len(asked) == shape.PASSES, "still on their way"
+    assert not passes((2, 3.0), (2, 2.0), (2, 1.0), (2, 0.5))[2] and len(asked) == pose_passes.PASSES, "still on their way"
 
 
 def test_two_photos_of_one_pile(tmp_path, monkeypatch):

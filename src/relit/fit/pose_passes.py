@@ -1,0 +1,202 @@
+"""Volume passes of identical objects with the poses of all instances: those for the poses alone, which are made until textures lie on one
+another, and what the last one shares with them. For the recipe `duplicates`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import mitsuba as mi
+import numpy as np
+
+from relit.cameras.se3 import rotation_angle, turns_apart
+from relit.errors import EXIT_FAILED, UserError
+from relit.fit.duplicates_options import DuplicatesOptions
+from relit.fit.duplicates_poses import named
+from relit.fit.instance_options import Search
+from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
+from relit.fit.joint_alignment import follow_views
+from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
+from relit.fit.odd_instances import odd_instances
+from relit.fit.outlines import follow_with_poses
+from relit.fit.pile_photos import Scene, gather
+from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.geometry.hull import NoShape
+from relit.geometry.mesh import extract_mesh
+from relit.geometry.sdf import dense_values
+from relit.rendering.shade_world import shade_world, start_world_light
+from relit.run import run_arrays
+from relit.scene import Mesh
+
+HOLD = 40  # steps of a volume pass of one level before poses move
+HOLD_OPENED = 100  # the same of a pass that begins with the shape of the one before, mended
+PASSES, ORDINALS = 4, ("first", "second", "third", "fourth")  # volume passes for the poses alone, at most
+JOINT = ("joint", *(f"joint_{k}" for k in range(2, PASSES + 1)))  # their stages
+ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last one
+CLOSE, CLOSER = 0.25, 0.8  # so was one that leaves textures within these pixels, or within so much of what the one before left
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What a volume pass for the poses alone gives. poses: (N, 4, 4). odd: (N,) bool, who shows what does not agree with the model of all.
+    turn: degrees by which it has turned the instances, the median. off: pixels, see `followed`. symmetry: of its shape; None where that is
+    not even."""
+
+    poses: np.ndarray
+    odd: np.ndarray
+    turn: float
+    off: float | None
+    symmetry: Symmetry | None
+
+    def arrived(self, last: Pass | None) -> bool:
+        """Whether another one would only lead the poses away again: textures brought them back to where they had been before, or as close
+        together as flow can tell, or hardly closer than in the pass before."""
+        if self.off is None:
+            return False
+        settled = last is not None and last.off is not None and self.off > CLOSER * last.off
+        return settled or self.turn < ARRIVED or self.off < CLOSE
+
+
+def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
+    """(poses, odd (N,) bool, arrived: see `Pass`, symmetry or None) after a first volume pass, and others while textures say that poses are
+    still on their way (at most PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with
+    the model of all. A shape that grew up with better poses is sharper, and moves them on."""
+    poses, odd, last, arrived = poses.copy(), np.zeros(len(views), bool), None, False
+    for number in range(PASSES):
+        rest = np.flatnonzero(~odd)
+        one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last)
+        poses[rest], odd[rest] = one.poses, one.odd
+        last, arrived = one, one.arrived(last)
+        if arrived or one.off is None:
+            break
+    return poses, odd, arrived, last.symmetry
+
+
+def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, last: Pass | None) -> Pass:
+    """One such pass, after `last`. Textures are asked here already: what the pass has built in the wrong place it does not take back. Where
+    they have led the last one's poses, these stay while the shape is built: labels alone have misled them."""
+    name = JOINT[number]
+    if run.done(name):
+        saved = run_arrays(run, name, "joint")
+        off = float(saved["off"]) if "off" in saved else None
+        return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved))
+    title = f"shape and poses ({ORDINALS[number]} pass)"
+    with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
+        before, off, symmetry = poses, None, last and last.symmetry
+        still = last is not None and last.off is not None
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still)
+        poses = poses.copy()
+        odd = odd_instances(bank, model, seed)
+        for k in np.flatnonzero(odd):
+            run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
+        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
+        if "textures" not in options.without:
+            better, moved, off = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
+            mesh, poses[~odd] = (mesh, poses[~odd]) if off is None else (better, moved)
+        turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
+        symmetry = None if "symmetry" in options.without else find_symmetry(mesh, views, poses)
+        if number == 0 and symmetry is not None:
+            run.say("the object is its own mirror image: its silhouettes bound it from both sides")
+        kept = {} if off is None else {"off": off}
+        stage.save("joint", poses=poses, odd=odd, turn=turn, **kept, **(symmetry.arrays if symmetry else {}))
+    return Pass(poses, odd, turn, off, symmetry)
+
+
+def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, float | None]:
+    """(mesh, poses, off) as outlines, and where these are not exact textures too, have them. off: pixels by which textures do not lie on
+    one another then (median); None where they have no part in it."""
+    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+    pictures, masks, known = zip(*((v.rgb, v.mask, v.known) for v in views), strict=True)
+    if "textures" in options.without:
+        return *follow_with_poses(mesh, cameras, masks, known, options.outlines), None
+    mesh, poses, off = follow_views(mesh, cameras, pictures, masks, known, options.outlines)
+    if off is None:
+        return mesh, poses, None
+    before, after = off
+    run.say(
+        f"poses that follow the labels alone leave textures {before:.1f} pixels off (median): they follow both now ({after:.1f} pixels)"
+    )
+    return mesh, poses, after
+
+
+def shape_and_poses(
+    views: list[View],
+    poses: np.ndarray,
+    run,
+    stage,
+    options: DuplicatesOptions,
+    seed: int,
+    symmetry: Symmetry | None = None,
+    still: bool = False,
+    vessel: np.ndarray | None = None,
+):
+    """One volume pass: (model, its pixel bank, poses). symmetry: of the shape of the pass before, or None. still: the poses stay as they
+    are. vessel: distances that it begins with in the place of a hull, without the coarse level, or None."""
+    bank = pixel_bank(views, poses)
+    inside = np.concatenate([v.rgb[v.mask > 0.99] for v in views])
+    beside, there = mirrored_views(symmetry, views, poses) if symmetry else ([], np.zeros((0, 4, 4)))
+    values = vessel if vessel is not None else hull_of([*views, *beside], np.concatenate([poses, there]), options.levels[0])
+    model = start_model(values, np.maximum(inside.mean(0), 1e-3), None, full=False)
+    scene = related(views, poses, run)
+    model.appearance = shade_world if len(scene.motions) == 1 else partial(shade_world, turns=light_turns(views, scene))
+    model.reflections, model.rates = start_world_light(float(inside.mean()), len(views))
+    model.mirrored = symmetry and mirrored_rays(symmetry, bank, beside)
+    rate = 0.0 if still else pose_rate(views, options)
+    if rate > 0:
+        move_poses(bank, model)
+    # on a coarse grid the shape is wrong by more than the poses, which would follow it away from where they are
+    hold = options.level_steps[0] if len(options.levels) > 1 else HOLD
+    coarse = 0 if vessel is None else 1
+    levels, steps = options.levels[coarse:], options.level_steps[coarse:]
+    o = VolumeOptions(levels, steps, options.rays, refine_cameras=rate, hold=hold if vessel is None else HOLD_OPENED)
+
+    def begin_level(model: VolumeModel) -> None:
+        if rate > 0 and model.grid.n not in options.levels[:2]:
+            hold_distances(model)
+
+    fit_volume(bank, model, o, stage, seed, begin_level)
+    return model, bank, moved_poses(bank, views, poses)
+
+
+def hull_of(views: list[View], poses: np.ndarray, nodes: int) -> np.ndarray:
+    """Distances (n, n, n) of the visual hull. Raises UserError where nothing is left."""
+    try:
+        return carved(views, poses, nodes, 0.15, Search.depth, crossed=True)
+    except NoShape:
+        raise UserError(
+            "the silhouettes have nothing in common",
+            "poses are wrong, or the objects differ",
+            "check the label image",
+            code=EXIT_FAILED,
+        ) from None
+
+
+def pose_rate(views: list[View], options: DuplicatesOptions) -> float:
+    """Step of the pose corrections in the volume pass."""
+    return 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
+
+
+def related(views: list[View], poses: np.ndarray, run=None) -> Scene:
+    """How the photos stand to each other (see `fit.pile_photos`); says so where a run is given and there are several."""
+    scene = gather(np.linalg.inv(poses), np.array([v.photo for v in views]))
+    if run is not None and len(scene.motions) > 1:
+        for number, motion in enumerate(scene.motions[1:], 2):
+            if motion is None:
+                run.say(f"note: photo {number} could not be related to the first: it helps to find the shape, but not material and light")
+                continue
+            run.say(f"photo {number} is turned by {rotation_angle(motion[:3, :3]):.0f} degrees against the first")
+        used = [m for m in scene.motions if m is not None]
+        run.say(f"{len(scene.standing)} instances in {len(used)} photos")
+    return scene
+
+
+def motion_or_none(motion: np.ndarray | None) -> np.ndarray:
+    """The motion, or none at all where it is not known."""
+    return np.eye(4) if motion is None else motion
+
+
+def light_turns(views: list[View], scene: Scene):
+    """Rotations from each view's photo to the first one's axes, flat, for `shade_world`."""
+    turns = [motion_or_none(scene.motions[v.photo])[:3, :3] for v in views]
+    return mi.Float(np.concatenate([t.ravel() for t in turns]).astype(np.float32))
