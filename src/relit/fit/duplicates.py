@@ -27,7 +27,7 @@ from relit.fit.duplicates_options import DuplicatesOptions, options_for
 from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.duplicates_shape import shape_stages
 from relit.fit.first_material import PAINT, first_material
-from relit.fit.hidden_light import HiddenLight, hidden_from
+from relit.fit.hidden_light import ASLANT, HiddenLight, hidden_from
 from relit.fit.instances import ANOTHER_PHOTO
 from relit.fit.lit_pile import lit_pile, surface_options
 from relit.fit.pile_scene import ground_colour, ground_reflectance, light_below
@@ -143,8 +143,9 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
 
 
 def shown_faces(pile: Mesh, which: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """(F,) bool: faces of the object that some camera sees on one of the instances `which` (K,) bool. All K come first in the pile."""
-    seen = seen_faces(pile, cameras)
+    """(F,) bool: faces of the object that some camera sees, not all too aslant, on one of the instances `which` (K,) bool. All K come first
+    in the pile."""
+    seen = seen_faces(pile, cameras, ASLANT)
     instances = (pile.uvs[pile.faces[:, 0], 0] > NO_TEXELS).sum()
     return seen[:instances].reshape(len(which), -1)[which].any(0)
 

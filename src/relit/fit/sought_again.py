@@ -60,7 +60,7 @@ def sought_again(
     revolution, handles aside, whose silhouette tells all but the turn about the axis: of a view and its pose (4, 4), the pose with which it
     shows what the others show (`turn_guess.turned_alike`); where nothing is certain the best place whose silhouette agrees is taken then.
     """
-    distance, tried = float(np.linalg.norm(guide_pose[:3, 3])), []
+    distance = float(np.linalg.norm(guide_pose[:3, 3]))
     for turn in range(ROUNDS if on_axis is None else 1):
         poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis, Axis(np.zeros(3), UP))
         if len(poses) == 0:
@@ -71,16 +71,13 @@ def sought_again(
             return pose, True
         if on_axis is not None:
             return pose if turned is None else turned(view, pose), False
-        tried.append((poses, errors))
+        if turned is not None:
+            there = where_outlines_agree(errors, view, poses, model)
+            if np.isfinite(there).any():
+                return turned(view, likeliest(poses, there, level)[0]), False
         if np.nanmin(errors) <= AGREES * level:
             break
-    if turned is None or not tried:
-        return None, False
-    poses, errors = (np.concatenate(part) for part in zip(*tried, strict=True))
-    errors = where_outlines_agree(errors, view, poses, model)
-    if not np.isfinite(errors).any():
-        return None, False
-    return turned(view, likeliest(poses, errors, level)[0]), False
+    return None, False
 
 
 def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.ndarray, bool]:

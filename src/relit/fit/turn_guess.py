@@ -42,6 +42,7 @@ from relit.scene import Camera, Mesh
 TURNS = 120  # that are compared
 PLACES = 8  # that descend
 ROUNDS = 8  # of their descent
+ASTRAY = 3.0  # degrees by which the axis leans after a descent that was led astray: the silhouette had told it better
 EXPECTED = 0.6  # correlation of what two views show of the same place: of views at their true poses .4 to .7
 
 
@@ -78,8 +79,16 @@ def turned_alike(others: Others, view: View, pose: np.ndarray, axis: Axis) -> np
     turns = [turned_by(pose, axis, a) for a in np.arange(TURNS) * 2 * np.pi / TURNS]
     evidence = agreement(others, view, turns)
     peaks = np.flatnonzero((evidence >= np.roll(evidence, 1)) & (evidence >= np.roll(evidence, -1)))
-    ends = [descended_alike(others, view, turns[k]) for k in peaks[np.argsort(-evidence[peaks])[:PLACES]]]
+    best = peaks[np.argsort(-evidence[peaks])[:PLACES]]
+    ends = [descended_alike(others, view, turns[k]) for k in best]
+    ends = [end if leaning(end, pose, axis) < ASTRAY else turns[k] for k, end in zip(best, ends, strict=True)]
     return ends[int(np.argmax([likelihood(others, view, p) for p in ends]))]
+
+
+def leaning(one: np.ndarray, other: np.ndarray, axis: Axis) -> float:
+    """Degrees between the axis in the picture as two poses (4, 4) have it."""
+    a, b = (p[:3, :3].T @ axis.direction for p in (one, other))
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
 def turned_by(pose: np.ndarray, axis: Axis, angle: float) -> np.ndarray:

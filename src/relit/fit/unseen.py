@@ -39,13 +39,13 @@ def without_unseen(mesh: Mesh, cameras: list[Camera]) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), normals)
 
 
-def seen_faces(mesh: Mesh, cameras: list[Camera]) -> np.ndarray:
-    """(F,) bool: faces that some camera sees from outside, in their middle or near one of their corners."""
+def seen_faces(mesh: Mesh, cameras: list[Camera], cosine: float = 0.0) -> np.ndarray:
+    """(F,) bool: faces that some camera sees from outside, under a cosine above `cosine`, in their middle or near one of their corners."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     points = np.concatenate([corners.mean(1, keepdims=True), 0.7 * corners + 0.3 * corners.mean(1, keepdims=True)], 1)
-    seen = seen_points(build_geometry(mesh), points.reshape(-1, 3), np.repeat(normals, 4, axis=0), cameras)
+    seen = seen_points(build_geometry(mesh), points.reshape(-1, 3), np.repeat(normals, 4, axis=0), cameras, cosine)
     return seen.reshape(-1, 4).any(1)
 
 
