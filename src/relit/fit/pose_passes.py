@@ -74,8 +74,7 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
 
 
 def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, last: Pass | None) -> Pass:
-    """One such pass, after `last`. Textures are asked here already: what the pass has built in the wrong place it does not take back. Where
-    they have led the last one's poses, these stay while the shape is built: labels alone have misled them."""
+    """One such pass, after `last`. Textures are asked here already: what the pass has built in the wrong place it does not take back."""
     name = JOINT[number]
     if run.done(name):
         saved = run_arrays(run, name, "joint")
@@ -84,8 +83,7 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
         before, off, symmetry = poses, None, last and last.symmetry
-        still = last is not None and last.off is not None
-        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still)
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry)
         poses = poses.copy()
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
