@@ -82,8 +82,8 @@ def linked_sets(views, links, distance: float) -> list[Branch]:
 
 
 def by_axes(revolved: Placed, say) -> Found:
-    """Bodies of revolution as outlines and decoration have them, of which some are not sure of their turn: a search over all poses would
-    lose the axes. Where most are sure the others are left out, to be sought in the finished model of these."""
+    """Bodies of revolution as outlines and decoration have them: a search over all poses would lose the axes. Where most are sure of their
+    turn the others are left out, to be sought in the finished model of these."""
     scores, unsure = revolved.own.copy(), list(revolved.unsure)
     if unsure and mostly_sure(revolved):
         scores[unsure] = LEFT_OUT
@@ -104,6 +104,8 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     crops = crops_of(views)
     best: Placed | None = None
     revolved = place_revolved(views, crops, o, seed=seed, say=say)
+    if revolved is not None and revolved.certain and mostly_sure(revolved.placed):
+        return by_axes(revolved.placed, say)
     if revolved is not None:
         best = confirmed(views, crops, crop_rings(crops, DETAILED), revolved.placed, o, seed=seed, links=links)
         if revolved.certain and not believed(best, o):
