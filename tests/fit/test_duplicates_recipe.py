@@ -24,6 +24,7 @@ from relit.fit import duplicates_poses as poses_stage
 from relit.fit import duplicates_shape as shape
 from relit.fit import odd_instances as odd
 from relit.fit import pose_passes
+from relit.geometry.sdf import node_positions
 from relit.images import write_linear
 from relit.run import Run
 
@@ -192,6 +193,31 @@ def test_poses_wait_for_the_coarse_level_and_distances_move_on_the_middle_one(pi
     assert not np.array_equal(last[:, :3], middle[:, :3])
     own = [c[:, 7] - c[:, 7].mean() for c in (middle, last)]  # what all do in common is taken out of them at every step
     assert np.allclose(*own, atol=1e-6)
+
+
+def test_the_shape_is_built_again_where_the_poses_are_now(pile, tmp_path):
+    """On the middle level, and so that the silhouettes at those poses, and not at others, are its own."""
+    capture, options = open_capture(pile), small_options(levels=(16, 32, 48), level_steps=(40, 60, 0), rays=1024)
+    shots = [(p.load(), p.camera.with_pose(np.eye(4))) for p in capture.photos]
+    views, poses = poses_stage.all_views(shots, options.side, options), true_poses(pile)
+    with Run.open(tmp_path / "run", {}) as run:
+        values = shape.built_again(views, poses, None, run, options, 0)
+    assert values.shape == (32, 32, 32)
+    inside = node_positions(32).reshape(-1, 3)[values.ravel() < 0]
+    wrong = np.array([similarity(exp_so3(np.radians([0, 0, 90.0])), np.zeros(3)) @ p for p in poses])
+
+    def beside(some):
+        """Share of what is inside that a view shows as background."""
+        shares = []
+        for view, pose in zip(views, some, strict=True):
+            x, y, _ = view.camera.with_pose(pose).project(inside).T.astype(int)
+            h, w = view.mask.shape
+            away = (x < 0) | (y < 0) | (x >= w) | (y >= h)  # windows hold all of the object
+            x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
+            shares.append((away | ((view.mask[y, x] < 0.5) & (view.known[y, x] > 0.5))).mean())
+        return np.mean(shares)
+
+    assert beside(poses) < 0.1 < 2 * beside(wrong)
 
 
 def test_odd_instances_are_few_among_many(monkeypatch):

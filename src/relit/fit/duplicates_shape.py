@@ -4,6 +4,8 @@ found again, the mesh, and the ground that they stand on. For the recipe `duplic
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 
@@ -13,6 +15,8 @@ from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import Shot, named
 from relit.fit.instances import View
 from relit.fit.lit_pile import LitPile, lit_pile, surface_options
+from relit.fit.loop import NoStage
+from relit.fit.mirrored import Symmetry
 from relit.fit.odd_instances import view_errors
 from relit.fit.pile_photos import Scene
 from relit.fit.pile_scene import distance_in, find_ground, set_down
@@ -124,7 +128,7 @@ def volume_stage(
         poses, odd, arrived, symmetry = joint_stages(views, poses, run, options, seed)
         others = [*others, *(views[k] for k in np.flatnonzero(odd))]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
-        vessel = vessel_stage(shots, views, poses, run, options, seed)
+        vessel = vessel_stage(shots, views, poses, symmetry, run, options, seed)
     steps = sum(options.level_steps) if vessel is None else sum(options.level_steps[1:])
     with run.stage("volume", steps=steps, title="shape and poses (volume pass)") as stage:
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still=arrived, vessel=vessel)
@@ -134,7 +138,9 @@ def volume_stage(
         return views, poses, model, arrived, vague
 
 
-def vessel_stage(shots: list[Shot], views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
+def vessel_stage(
+    shots: list[Shot], views: list[View], poses: np.ndarray, symmetry: Symmetry | None, run, options: DuplicatesOptions, seed: int
+) -> np.ndarray | None:
     """Distances that the finer levels of the volume pass begin with, where the object is a body of revolution whose ends silhouettes do not
     show as they are (`fit.vessel_trial.vessel_of`); None for others."""
     if "vessels" in options.without or len(options.levels) < 2:
@@ -145,6 +151,8 @@ def vessel_stage(shots: list[Shot], views: list[View], poses: np.ndarray, run, o
     last = [name for name in JOINT if run.done(name)][-1]
     with run.stage("vessel", title="mouths and lids") as stage:
         values = redistance(resample(run_arrays(run, last, "checkpoint")["values"], options.levels[1]))
+        if body_axis(extract_mesh(values)) is not None:  # the last pass has built it where the poses were before
+            values = built_again(views, poses, symmetry, run, options, seed)
         scene = related(views, poses)
         inside = [v.rgb[v.mask > 0.99].mean(0) for v in views]
 
@@ -156,6 +164,13 @@ def vessel_stage(shots: list[Shot], views: list[View], poses: np.ndarray, run, o
         found = vessel_of(values, views, poses, lit, surface_options(options), run.say, seed, run.progress("mouths and lids"))
         stage.save("vessel", values=np.zeros((0, 0, 0), np.float32) if found is None else found)
     return found
+
+
+def built_again(views: list[View], poses: np.ndarray, symmetry: Symmetry | None, run, options: DuplicatesOptions, seed: int) -> np.ndarray:
+    """Distances (n, n, n) of the shape where the poses are now, which stay, on the middle level."""
+    coarse = replace(options, levels=options.levels[:2], level_steps=options.level_steps[:2])
+    model, _, _ = shape_and_poses(views, poses, run, NoStage(), coarse, seed, symmetry, still=True)
+    return redistance(dense_values(model.grid))
 
 
 def carried(some: dict[int, np.ndarray], before: np.ndarray, after: np.ndarray) -> dict[int, np.ndarray]:
