@@ -217,7 +217,7 @@ def test_the_shape_is_built_again_where_the_poses_are_now(pile, tmp_path):
             shares.append((away | ((view.mask[y, x] < 0.5) & (view.known[y, x] > 0.5))).mean())
         return np.mean(shares)
 
-    assert beside(poses) < 0.1 < 2 * beside(wrong)
+    assert beside(poses) < 0.1 and beside(wrong) > 0.3
 
 
 def test_odd_instances_are_few_among_many(monkeypatch):
@@ -264,9 +264,9 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
         """(poses, odd, arrived, symmetry), asked for passes which turn the instances by so many degrees, and leave textures so far off."""
         asked.clear()
 
-        def stage(views, poses, number, run, options, seed, last):
+        def stage(views, poses, number, run, options, seed, symmetry):
             asked.append(list(views))
-            assert (last and last.symmetry) == (number or None)  # that of the pass before
+            assert symmetry == (number or None)  # that of the pass before
             odd = np.array([v == "b" for v in views])
             return pose_passes.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, *told[number], number + 1)
 

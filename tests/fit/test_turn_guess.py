@@ -100,3 +100,10 @@ def test_the_right_pose_of_a_view_shows_what_the_others_show():
     tried[:, :3, :3] = [exp_so3(np.radians(a) * up) for a in (-40, -20, -6, 0, 6, 20, 40)]
     for told in (agreement(others, views[0], tried @ poses[0]), np.array([likelihood(others, views[0], p) for p in tried @ poses[0]])):
         assert told.argmax() == 3 and told[3] > 3 * max(told[0], told[1], told[5], told[6], 0)
+
+
+def test_a_view_that_tells_nothing_stays_where_it_is(around):
+    """All of its outline is hidden, and so are its textures."""
+    mesh, views, poses = around
+    hidden = replace(views[0], known=np.zeros_like(views[0].known))
+    assert np.allclose(descended_alike(others_of(mesh, views[1:], poses[1:]), hidden, poses[0]), poses[0])

@@ -190,9 +190,7 @@ def with_found(
     level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
     mesh = extract_mesh(dense_values(model.grid))
-    found, vague, axis = [], [], body_axis(mesh)
-    shown = axis and others_of(mesh, views, poses)
-    turned = axis and ((lambda view, pose: turned_alike(shown, view, pose, axis)) if shown else (lambda _, pose: pose))
+    found, vague, turned = [], [], turned_by_others(mesh, views, poses)
     for view in others:
         pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), turned)
         if pose is not None and not sure:
@@ -204,3 +202,13 @@ def with_found(
     count = len(found) + len(vague)
     model.reflections = mi.Float(np.concatenate([np.array(model.reflections), np.zeros(4 * count, np.float32)]))
     return [*views, *(v for v, _ in found)], np.concatenate([poses, *(p[None] for _, p in found)]), vague
+
+
+def turned_by_others(mesh: Mesh, views: list[View], poses: np.ndarray):
+    """What turns another view's pose about the axis of a body of revolution, as `sought_again` asks for it, by what `views` show; the pose
+    as it is where they show no texture, and None where the mesh is no such body."""
+    axis = body_axis(mesh)
+    if axis is None:
+        return None
+    others = others_of(mesh, views, poses)
+    return (lambda _, pose: pose) if others is None else (lambda view, pose: turned_alike(others, view, pose, axis))

@@ -65,7 +65,7 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     poses, odd, last, arrived = poses.copy(), np.zeros(len(views), bool), None, False
     for number in range(PASSES):
         rest = np.flatnonzero(~odd)
-        one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last)
+        one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last and last.symmetry)
         poses[rest], odd[rest] = one.poses, one.odd
         last, arrived = one, one.arrived(last)
         if arrived or one.off is None:
@@ -73,8 +73,11 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     return poses, odd, arrived, last.symmetry
 
 
-def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, last: Pass | None) -> Pass:
-    """One such pass, after `last`. Textures are asked here already: what the pass has built in the wrong place it does not take back."""
+def joint_stage(
+    views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, symmetry: Symmetry | None
+) -> Pass:
+    """One such pass. symmetry: of the shape of the one before. Textures are asked here already: what the pass has built in the wrong place
+    it does not take back."""
     name = JOINT[number]
     if run.done(name):
         saved = run_arrays(run, name, "joint")
@@ -82,16 +85,16 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
         return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved))
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
-        before, off, symmetry = poses, None, last and last.symmetry
+        before, off = poses, None
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry)
-        poses = poses.copy()
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         if "textures" not in options.without:
             better, moved, off = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
-            mesh, poses[~odd] = (mesh, poses[~odd]) if off is None else (better, moved)
+            if off is not None:
+                mesh, poses[~odd] = better, moved
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
         symmetry = None if "symmetry" in options.without else find_symmetry(mesh, views, poses)
         if number == 0 and symmetry is not None:

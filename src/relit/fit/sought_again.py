@@ -23,7 +23,7 @@ from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from, volume_render
 from relit.fit.revolution import UP
-from relit.fit.turn_guess import turned_by
+from relit.fit.turn_guess import all_turns
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.geometry.revolution_axis import Axis
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
@@ -62,7 +62,7 @@ def sought_again(
     """
     distance = float(np.linalg.norm(guide_pose[:3, 3]))
     for turn in range(ROUNDS if on_axis is None else 1):
-        poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis, Axis(np.zeros(3), UP))
+        poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis, Axis(np.zeros(3), UP), TURNS)
         if len(poses) == 0:
             continue
         poses, errors = descended(view, guide, guide_pose, poses, model, turns, seed + turn)
@@ -100,11 +100,6 @@ def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
     drawn = volume_render(model)([square.with_pose(p) for p in poses])[1][:, :h, :w] > 0.5
     own, known = view.mask > 0.5, view.known > 0.5
     return (drawn & own & known).sum((1, 2)) / np.maximum(((drawn | own) & known).sum((1, 2)), 1)
-
-
-def all_turns(pose: np.ndarray, axis: Axis, count: int = TURNS) -> np.ndarray:
-    """(count, 4, 4): the pose with the object turned about its axis."""
-    return np.array([turned_by(pose, axis, a) for a in np.arange(count) * 2 * np.pi / count])
 
 
 def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:

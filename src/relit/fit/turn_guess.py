@@ -76,7 +76,7 @@ def others_of(mesh: Mesh, views: list[View], poses: np.ndarray) -> Others | None
 def turned_alike(others: Others, view: View, pose: np.ndarray, axis: Axis) -> np.ndarray:
     """The pose (4, 4) of a view, right up to a turn about the axis, with which it shows what the others show. A guess even where one place
     is clearly the likeliest: half a turn of a pattern that repeats can look more alike than its own."""
-    turns = [turned_by(pose, axis, a) for a in np.arange(TURNS) * 2 * np.pi / TURNS]
+    turns = all_turns(pose, axis, TURNS)
     evidence = agreement(others, view, turns)
     peaks = np.flatnonzero((evidence >= np.roll(evidence, 1)) & (evidence >= np.roll(evidence, -1)))
     best = peaks[np.argsort(-evidence[peaks])[:PLACES]]
@@ -91,13 +91,18 @@ def leaning(one: np.ndarray, other: np.ndarray, axis: Axis) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
+def all_turns(pose: np.ndarray, axis: Axis, count: int) -> np.ndarray:
+    """(count, 4, 4): the pose with the object turned about its axis."""
+    return np.array([turned_by(pose, axis, a) for a in np.arange(count) * 2 * np.pi / count])
+
+
 def turned_by(pose: np.ndarray, axis: Axis, angle: float) -> np.ndarray:
     """The pose with the object turned about an axis, by radians."""
     turn = exp_so3(angle * axis.direction)
     return similarity(turn, axis.point - turn @ axis.point) @ pose
 
 
-def agreement(others: Others, view: View, poses) -> np.ndarray:
+def agreement(others: Others, view: View, poses: np.ndarray) -> np.ndarray:
     """(K,) evidence, for each of poses (K, 4, 4) of a view, that it shows the same pattern as those of the others that look from the
     nearest sides: - n / 2 log(1 - ρ²) for each, ρ the correlation of their brightness, freed of what is local, and n the patches that
     both show."""
