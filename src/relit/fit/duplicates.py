@@ -27,6 +27,7 @@ from relit.fit.duplicates_options import DuplicatesOptions, options_for
 from relit.fit.duplicates_poses import all_views, poses_stage
 from relit.fit.duplicates_shape import shape_stages
 from relit.fit.first_material import PAINT, first_material
+from relit.fit.ground_paint import ground_as_shown
 from relit.fit.hidden_light import ASLANT, HiddenLight, hidden_from
 from relit.fit.instances import ANOTHER_PHOTO
 from relit.fit.lit_pile import lit_pile, surface_options
@@ -72,7 +73,8 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     camera = photos[0].camera
     maps = run_arrays(run, "surface", "maps") if run.done("surface") else surface_stage(shots, camera, mesh, parts, run, options, seed)
-    return assemble(photos, mesh, maps, parts, dict(zip(keys.tolist(), unsure.tolist(), strict=True)))
+    asset = assemble(photos, mesh, maps, parts, dict(zip(keys.tolist(), unsure.tolist(), strict=True)))
+    return ground_as_shown(asset, shots[0][0], seed)
 
 
 def labelled_photos(capture: Capture) -> tuple:

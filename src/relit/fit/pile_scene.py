@@ -199,7 +199,8 @@ def ground_colour(pixels, plane: np.ndarray) -> np.ndarray:
 
 
 def ground_reflectance(environment: np.ndarray, up: np.ndarray, radiance: np.ndarray) -> np.ndarray:
-    """(3,) base colour of a diffuse ground that shows `radiance` (3,) under the whole sky of the environment (H, W, 3)."""
+    """(3,) base colour of a diffuse ground that shows `radiance` (3,) under the whole sky of the environment (H, W, 3): what hides a part
+    of the sky is left to `ground_paint.ground_as_shown`."""
     h, w = environment.shape[:2]
     cosine = np.maximum(environment_directions(h, w) @ np.asarray(up, np.float64), 0) * environment_solid_angles(h, w)
     return np.clip(radiance * np.pi / np.maximum((environment * cosine[..., None]).sum((0, 1)), 1e-6), 0.02, 0.95)
