@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from relit.cameras.se3 import nearest_rotation, rotation_angle
-from relit.conventions import move_points, similarity, world_from_cv_camera
+from relit.conventions import move_points, scale_of, similarity, world_from_cv_camera
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.results import entries, means
@@ -23,6 +23,7 @@ from relit.scene import Asset, Camera, Ground, Pixels
 
 VISIBLE = 0.25  # share of an instance that must be seen for it to count among those to be registered
 SAMPLES = 30_000
+GUESSED = 0.1  # weight of a first guess beside one instance
 PHOTO_SIDE = 480  # pixels of the re-rendered photo, longer side
 MASKED = f"pixels of the objects (truth coverage >= {m.MASK}) in novel views of the whole pile; a pixel without a prediction is black"
 DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
@@ -96,7 +97,7 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     true_points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).points
     scale, frame = scene_alignment(poses, true_poses, photo, true_points, asset)
     radius = truth["radius"]
-    values["translation_median"] = centre_error(poses, true_poses, photo, scale, frame, true_points) / radius
+    values["translation_median"] = centre_error(poses, true_poses, photo, true_points, frame) / radius
     values["surface_median"] = surface_error(poses, true_poses, photo, scale, frame, true_points[:: SAMPLES // 2000]) / radius
     own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
     values["chamfer"] = chamfer(true_points, own, frame)
@@ -296,14 +297,27 @@ def scene_alignment(poses: dict, true_poses: dict, photo: Camera, true_points: n
     size = np.ptp(asset.mesh.vertices, axis=0).max() / np.ptp(true_points, axis=0).max()
     frame = similarity(turn, own - size * turn @ middle, size)
     frame = icp(true_points[::10], asset.mesh.vertices.astype(np.float64), frame)
-    # distances tell the scale far better than sizes: a per cent of the distance is a tenth of an object
-    ratios = [
-        np.linalg.norm(move_points(true_poses[k], middle) - photo.centre)
-        / np.linalg.norm(move_points(poses[k] @ frame, middle) - photo.centre)
-        for k in poses
-        if k in true_poses
-    ]
-    return float(np.median(ratios)), frame
+    return scale_about(photo.centre, poses, true_poses, middle, move_points(frame, middle))[0], frame
+
+
+def scale_about(centre: np.ndarray, poses: dict, true_poses: dict, middle: np.ndarray, guess: np.ndarray) -> tuple[float, np.ndarray]:
+    """(scale, point (3,) of the recovered object's frame) with which the recovered scene, grown about the camera's `centre`, has its
+    objects' points where the true ones have their `middle`: linear least squares over the instances, with less weight for those that are
+    off. guess: (3,) of that point; it counts for little, but where there is one instance alone. Distances tell the scale far better
+    than sizes, a per cent of a distance is a tenth of an object; and the point follows from the poses, as the alignment of two surfaces
+    does not tell it well enough where one has thicker walls."""
+    keys = [k for k in poses if k in true_poses]
+    there = np.array([move_points(true_poses[k], middle) - centre for k in keys])
+    rows = np.stack([np.concatenate([(poses[k][:3, 3] - centre)[:, None], poses[k][:3, :3]], 1) for k in keys])
+    held = GUESSED * scale_of(poses[keys[0]]) * np.concatenate([-guess[:, None], np.eye(3)], 1)
+    weight = np.ones(len(keys))
+    for _ in range(20):
+        root = np.sqrt(weight)[:, None]
+        a, b = np.concatenate([(rows * root[..., None]).reshape(-1, 4), held]), np.append(there * root, np.zeros(3))
+        solved = np.linalg.lstsq(a, b, rcond=None)[0]
+        off = np.linalg.norm(rows @ solved - there, axis=1)
+        weight = 1 / (1 + np.square(off / max(float(np.median(off)), 1e-9)))
+    return float(solved[0]), solved[1:] / solved[0]
 
 
 def icp(source: np.ndarray, target: np.ndarray, start: np.ndarray, rounds: int = 30) -> np.ndarray:
@@ -321,12 +335,11 @@ def icp(source: np.ndarray, target: np.ndarray, start: np.ndarray, rounds: int =
     return frame
 
 
-def centre_error(poses, true_poses, photo: Camera, scale: float, frame: np.ndarray, true_points: np.ndarray) -> float:
+def centre_error(poses, true_poses, photo: Camera, true_points: np.ndarray, frame: np.ndarray) -> float:
     middle = (true_points.min(0) + true_points.max(0)) / 2
+    scale, own = scale_about(photo.centre, poses, true_poses, middle, move_points(frame, middle))
     grow = grown_about(photo.centre, scale)
-    distances = [
-        np.linalg.norm(move_points(grow @ poses[k] @ frame, middle) - move_points(true_poses[k], middle)) for k in poses if k in true_poses
-    ]
+    distances = [np.linalg.norm(move_points(grow @ poses[k], own) - move_points(true_poses[k], middle)) for k in poses if k in true_poses]
     return float(np.median(distances))
 
 

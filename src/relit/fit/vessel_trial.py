@@ -50,8 +50,8 @@ def vessel_of(
     progress: Callable[[int], None] | None = None,
 ) -> np.ndarray | None:
     """Distances of a body of revolution as narrow all around as its silhouettes say, with its ends cut off square, and hollow under each
-    end that is a mouth; None where it is no such body, or is all that already. values: (n, n, n) of the shape so far. lit: the pile of instances of a mesh. options: of the
-    surface pass."""
+    end that is a mouth; None where it is no such body, or is all that already. values: (n, n, n) of the shape so far. lit: the pile of
+    instances of a mesh. options: of the surface pass."""
     axis = body_axis(extract_mesh(values))
     if axis is None:
         return None
