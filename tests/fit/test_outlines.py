@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from relit.cameras.se3 import exp_so3
-from relit.fit.outlines import Outline, follow_outlines, follow_with_poses, laplacian, outline_of, solve, trace
+from relit.fit.outlines import Outline, follow_outlines, follow_with_places, follow_with_poses, laplacian, outline_of, solve, trace
 from relit.geometry.tangents import vertex_normals
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
@@ -117,3 +117,25 @@ def test_poses_follow_too():
     _, found = follow_with_poses(truth, wrong, hidden, known)
     error = lambda poses: np.std([np.linalg.inv(p)[2, 3] for p in poses])  # noqa: E731  (all together may be nearer to a smaller object)
     assert error(found) < 0.3 * error([c.world_from_camera for c in wrong])
+
+
+def test_places_follow_and_turns_stay(seen):
+    """Every camera is moved, the first one turned too; one that the mesh is not told by finds its place on the mesh of the others."""
+    cameras, masks = seen
+    rng, off = np.random.default_rng(5), []
+    for k, c in enumerate(cameras):
+        step = np.eye(4)
+        step[:3, 3] = rng.normal(0, 0.02, 3)
+        step[:3, :3] = exp_so3(np.radians([0.0, 0.0, 2.0])) if k == 0 else np.eye(3)
+        off.append(c.with_pose(c.world_from_camera @ step))
+    known, telling = [np.ones_like(m) for m in masks], np.arange(len(cameras)) > 3
+    mesh, poses = follow_with_places(ball(0.505), off, masks, known, telling, 4)
+    size = np.linalg.norm(mesh.vertices, axis=1).mean() / 0.5  # all together may be nearer to a smaller object
+
+    def off_by(poses):
+        return np.array([np.linalg.norm(p[:3, 3] - c.world_from_camera[:3, 3]) for p, c in zip(poses, cameras, strict=True)])
+
+    before, after = off_by([c.world_from_camera for c in off]), off_by([np.block([[p[:3, :3], p[:3, 3:] / size], [p[3:]]]) for p in poses])
+    assert size == pytest.approx(1, abs=0.02)
+    assert np.median(before) > 0.025 and np.median(after) < 0.25 * np.median(before) and (after[:4] < 0.5 * before[:4]).all()
+    assert all(np.array_equal(p[:3, :3], o.world_from_camera[:3, :3]) for p, o in zip(poses, off, strict=True))

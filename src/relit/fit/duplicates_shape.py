@@ -18,6 +18,7 @@ from relit.fit.lit_pile import LitPile, lit_pile, surface_options
 from relit.fit.loop import NoStage
 from relit.fit.mirrored import Symmetry
 from relit.fit.odd_instances import view_errors
+from relit.fit.outlines import follow_with_places
 from relit.fit.pile_photos import Scene
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
@@ -55,10 +56,13 @@ def shape_stages(
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
-        if rate > 0 and not arrived:  # else outlines and textures have had their say before the last pass
+        if rate > 0 and not arrived:
             mesh, poses, _ = followed(mesh, views, poses, run, options)
+        telling = len(views)
         if vague:
             views, poses = [*views, *(v for v, _ in vague)], np.concatenate([poses, *(p[None] for _, p in vague)])
+        if rate > 0 and arrived:  # outlines and textures have had their say about the turns, by the shape of the pass before
+            mesh, poses = placed_by_outlines(mesh, views, poses, telling, options.outlines)
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
@@ -91,6 +95,14 @@ def shape_stages(
         }
         stage.save("mesh", **parts)
     return parts
+
+
+def placed_by_outlines(mesh: Mesh, views: list[View], poses: np.ndarray, telling: int, rounds: int) -> tuple[Mesh, np.ndarray]:
+    """(mesh, poses) as outlines have the mesh and where its instances stand, whose turns stay. telling: so many views, the first, move the
+    mesh; the others are placed by it."""
+    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+    masks, known = zip(*((v.mask, v.known) for v in views), strict=True)
+    return follow_with_places(mesh, cameras, masks, known, np.arange(len(views)) < telling, rounds)
 
 
 def parts_of(mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndarray]) -> dict[str, np.ndarray]:

@@ -71,6 +71,30 @@ def follow_with_poses(mesh: Mesh, cameras: list[Camera], masks, known, rounds: i
     return mesh, np.array([c.world_from_camera for c in cameras])
 
 
+def follow_with_places(mesh: Mesh, cameras: list[Camera], masks, known, telling: np.ndarray, rounds: int = 3) -> tuple[Mesh, np.ndarray]:
+    """As `follow_with_poses` with the turns of the cameras as they are: they move along and across their lines of sight alone.
+    telling: (N,) bool, those by which the mesh moves; the others go where it has them."""
+    for _ in range(rounds):
+        scene = build_geometry(mesh)
+        for _ in range(2):
+            found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
+            cameras = [c.with_pose(placed(c, outline)) for c, outline in zip(cameras, found, strict=True)]
+        some = [(c, m, k) for c, m, k, tells in zip(cameras, masks, known, telling, strict=True) if tells]
+        mesh = moved(mesh, solve(mesh, [outline_of(mesh, scene, c, m, k) for c, m, k in some]))
+    return mesh, np.array([c.world_from_camera for c in cameras])
+
+
+def placed(camera: Camera, outline: Outline) -> np.ndarray:
+    """As `turned`, by translations alone."""
+    if len(outline.point) < 30:
+        return np.asarray(camera.world_from_camera, np.float64)
+    rows, trust = by_motion(camera, outline, outline.point.mean(0))[:, 3:], precision(outline.shift)
+    normal = (rows * trust[:, None]).T @ rows
+    normal += 1e-6 * np.diag(np.diag(normal))
+    step = np.linalg.solve(normal, rows.T @ (trust * outline.shift))
+    return after_motion(camera, np.concatenate([np.zeros(3), step]), np.zeros(3))
+
+
 def turned(camera: Camera, outline: Outline) -> np.ndarray:
     """The camera's pose (4, 4) with which the outline moves as its samples ask for: one Gauss-Newton step over turns about the middle of
     what is seen, and translations."""

@@ -20,17 +20,19 @@ from relit.geometry.sdf import node_positions
 from relit.scene import Camera
 
 TURNS = 72  # places on a circle that are asked
-RULED_OUT = 0.1  # share of a circle that may lie outside of silhouettes; a circle is touched by an outline on a few degrees already
-BESIDE = 0.25  # share of the views of a place in which it must stick out beside the turned body to be part of a handle
+RULED_OUT = 0.05  # share of a circle: one that is a hundredth too wide shows so much of itself at the sides of a view
+AGREEING = 0.25  # share of the views: poses are not exact, and where each outline cuts off a little, all together cut off too much
+SLACK = 1.0  # voxels; the axis and the poses are not exact, and the fit that follows does not put back what was cut off
+BESIDE = 0.15  # share of the views of a place in which it must stick out beside the turned body to be part of a handle
 NEAR = 2  # voxels around what sticks out that stay as they are
 
 
 def turned_body(values: np.ndarray, axis: Axis, views: list[View], cameras: list[Camera]) -> np.ndarray:
     """Distances of the shape `values` (n, n, n) without what the silhouettes rule out all around the axis, handles left as they are.
     cameras: of the views, unit frame."""
-    p, inside = node_positions(values.shape[0]), values < 0
+    p, inside, voxel = node_positions(values.shape[0]), values < 0, 2 / (values.shape[0] - 1)
     heights, widest = widest_circles(values, axis, views, cameras)
-    beyond = (axis.radii(p) - np.interp(axis.heights(p), heights, widest)).astype(values.dtype)
+    beyond = (axis.radii(p) - np.interp(axis.heights(p), heights, widest) - SLACK * voxel).astype(values.dtype)
     spare = inside & (beyond > 0)
     if not spare.any():
         return values
@@ -39,8 +41,8 @@ def turned_body(values: np.ndarray, axis: Axis, views: list[View], cameras: list
 
 
 def widest_circles(values: np.ndarray, axis: Axis, views: list[View], cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """(H,) heights along the axis, half a voxel apart, and the radii (H,) up to which no circle about it is ruled out: one of which more
-    than RULED_OUT projects onto known background that is no neighbour of the silhouette. Nothing is ruled out that no view shows."""
+    """(H,) heights along the axis, half a voxel apart, and the radii (H,) up to which circles about it are not ruled out by AGREEING of the
+    views. A view rules out a circle of which it shows more than RULED_OUT on known background that is no neighbour of the silhouette."""
     step, inside = 1 / (values.shape[0] - 1), values < 0
     p = node_positions(values.shape[0])[inside]
     heights = np.arange(axis.heights(p).min(), axis.heights(p).max() + step, step)
@@ -49,13 +51,14 @@ def widest_circles(values: np.ndarray, axis: Axis, views: list[View], cameras: l
     a = np.arange(TURNS) * 2 * np.pi / TURNS
     ring = np.cos(a)[:, None] * across[0] + np.sin(a)[:, None] * across[1]
     points = axis.point + heights[:, None, None, None] * axis.direction + radii[None, :, None, None] * ring
-    empty = np.zeros(points.shape[:3], bool)
+    reach = []
     for view, camera in zip(views, cameras, strict=True):
         u, v, shown = nearest_pixels(camera, points.reshape(-1, 3))
         background = (cv2.dilate((view.mask > 0.5).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0) & (view.known > 0.5)
-        empty |= (background[v, u] & shown).reshape(empty.shape)
-    reach = np.cumprod(empty.mean(-1) <= RULED_OUT, axis=1).sum(1)
-    return heights, median_filter(reach * step, 3, mode="nearest")
+        empty = (background[v, u] & shown).reshape(points.shape[:3])
+        reach.append(np.cumprod(empty.mean(-1) <= RULED_OUT, axis=1).sum(1))
+    rank = max(1, round(AGREEING * len(reach))) - 1
+    return heights, median_filter((np.sort(reach, axis=0)[rank] + 0.5) * step, 3, mode="nearest")
 
 
 def sticking_out(body: np.ndarray, spare: np.ndarray, views: list[View], cameras: list[Camera]) -> np.ndarray:
