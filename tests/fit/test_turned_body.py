@@ -52,7 +52,7 @@ def test_a_waist_goes_all_around_and_the_handle_stays(seen):
     filling = start & ~truth
     handle = truth & ~solid(N, False, handle=False)
     assert (filling & found).sum() < 0.65 * filling.sum()
-    assert (handle & found).sum() > 0.99 * handle.sum()
+    assert (handle & found).sum() > 0.95 * handle.sum()
     assert (truth & ~found).sum() < 0.03 * truth.sum()
 
 
