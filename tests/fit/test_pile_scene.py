@@ -7,7 +7,7 @@ import pytest
 
 from relit.cameras.se3 import exp_so3
 from relit.conventions import environment_directions, move_points, similarity
-from relit.fit.pile_scene import ONTO, SETTLED, distance_in, ground_reflectance, light_below, set_down
+from relit.fit.pile_scene import ONTO, SETTLED, distance_in, ground_reflectance, light_below, parts_of_the_way, set_down
 from relit.geometry.sdf import node_positions
 
 UP = np.array([0.0, -np.sin(0.9), -np.cos(0.9)])  # of the ground, in the photo's frame
@@ -152,3 +152,12 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
     scene = TraceableMesh(together, radiance)
     points.x = mi.Point3f(points.x - dr.gather(mi.Vector3f, mi.Float(moves.ravel().astype(np.float32)), batch.view))
     assert open_sky(scene, points) < 0.75
+
+
+def test_sizes_that_agree_with_the_ground_are_believed_and_one_that_does_not_is_moved():
+    stands = np.arange(8) < 7
+    fine = np.array([0.01, -0.012, 0.009, 0.011, -0.01, 0.008, 0.15, 0.01])
+    parts = parts_of_the_way(fine, stands)
+    assert 0.5 < parts[0] < 0.8 and parts[6] > 0.99
+    assert (parts_of_the_way(0.1 * fine, stands)[:6] == 0).all()
+    assert (parts_of_the_way(5 * fine, stands) > 0.9).all()

@@ -24,6 +24,8 @@ FARTHEST = 0.02  # of its distance that an instance is moved at most
 BESIDE = 0.005  # the same for what is moved onto another instance, or from farther above the ground: that it rests there is a guess
 ONTO = 0.35  # of that way that it goes: its size tells its distance to .035 radii, touching another to .05, as few see the undersides
 TILT = 5.0  # degrees that the ground may turn meanwhile
+PLANE = 0.009  # unit lengths, the standard deviation of a distance that the ground tells: neither feet nor the plane are exact
+FAR = 3.0
 STEEP = 0.3  # sine of the angle at which the photo must look down on the ground for objects to be moved onto something
 GROUND_ROWS = 96
 ROOM = 40.0  # unit lengths between instances that are to stand alone: one fills a ten-thousandth of what its neighbour sees
@@ -57,8 +59,9 @@ def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray, distance: Distance) -> tuple[np.ndarray, np.ndarray, int]:
-    """Poses (N, 4, 4) and the plane after every instance was moved along its line of sight until it rests on the ground, or a part of the
-    way until it rests on another, and how many were. distance: of points in the object's frame from its surface, negative inside.
+    """Poses (N, 4, 4) and the plane after every instance was moved along its line of sight towards where it rests on the ground
+    (`parts_of_the_way`), or a part of the way until it rests on another, and how many were. distance: of points in the object's frame from
+    its surface, negative inside.
 
     The distance of an object is known by its size alone, and half a per cent of the distance is a tenth of an object; the plane under many
     of them is known far better, and nothing hangs in the air or lies below the ground. The plane goes through the middle of the lowest
@@ -79,17 +82,31 @@ def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray, distanc
         up = normal if normal @ plane[1] > np.cos(np.radians(TILT)) else plane[1]
     gaps = np.array([((s - point) @ up).min() for s in lowest])
     standing, placed, count = np.linalg.inv(poses), [], 0
+    steep = -(standing[:, :3, 3] @ up) / np.linalg.norm(standing[:, :3, 3], axis=1)
+    ways = gaps / np.maximum(steep, STEEP)  # along the lines of sight, unit lengths
+    parts = parts_of_the_way(ways, (gaps < TOUCHES) & (steep > STEEP))
     for k in np.argsort(gaps):
         ray = standing[k][:3, 3]
-        if -(ray @ up) > STEEP * np.linalg.norm(ray):
-            share, most = gaps[k] / -(ray @ up), FARTHEST  # of the distance: the object's middle moves by share * ray
+        if steep[k] > STEEP:
+            ground = ways[k] / np.linalg.norm(ray)
+            share, most = parts[k] * ground, FARTHEST  # of the distance: the object's middle moves by share * ray
             if gaps[k] > TOUCHES:
-                share, most = ONTO * resting_share(points, standing, k, placed, distance, share), ONTO * BESIDE
+                onto = resting_share(points, standing, k, placed, distance, ground)
+                share, most = ONTO * onto, ONTO * BESIDE
             if abs(share) < most:
                 standing[k][:3, 3] += share * ray
                 count += 1
         placed.append(k)
     return np.linalg.inv(standing), np.stack([point, up]), count
+
+
+def parts_of_the_way(ways: np.ndarray, stands: np.ndarray) -> np.ndarray:
+    """How much of its way along the line of sight to the ground each instance goes. ways: (N,) of all. stands: (N,) bool, who stands there.
+
+    Each has been measured twice, by its size and by the ground, and goes to the mean of both, each by the inverse of its variance: the
+    ground's is PLANE², and what the ways scatter is that of both. Whose way is FAR times as long was not measured by its size."""
+    spread = max(1.48 * float(np.median(np.abs(ways[stands]))), PLANE) if stands.any() else PLANE
+    return 1 - (PLANE / np.where(np.abs(ways) > FAR * spread, np.abs(ways), spread)) ** 2
 
 
 def resting_share(points: np.ndarray, standing: np.ndarray, k: int, placed: list[int], distance: Distance, ground: float) -> float:
