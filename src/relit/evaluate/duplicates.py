@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 
 from relit.cameras.se3 import nearest_rotation, rotation_angle
-from relit.conventions import move_points, scale_of, similarity, world_from_cv_camera
+from relit.conventions import move_points, world_from_cv_camera
 from relit.errors import UserError
 from relit.evaluate import metrics as m
+from relit.evaluate.pile_alignment import grown_about, object_turn, scene_alignment
 from relit.evaluate.results import entries, means
 from relit.files import parse_toml
 from relit.scene import Asset, Camera, Ground, Pixels
 
 VISIBLE = 0.25  # share of an instance that must be seen for it to count among those to be registered
 SAMPLES = 30_000
-GUESSED = 0.1  # weight of a first guess beside one instance
 PHOTO_SIDE = 480  # pixels of the re-rendered photo, longer side
 MASKED = f"pixels of the objects (truth coverage >= {m.MASK}) in novel views of the whole pile; a pixel without a prediction is black"
 DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
@@ -95,9 +95,9 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
 
     loaded = trimesh.load(folder / "truth" / "mesh.ply", process=False)
     true_points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).points
-    scale, frame = scene_alignment(poses, true_poses, photo, true_points, asset)
+    scale, own_middle, frame = scene_alignment(poses, true_poses, photo, true_points, asset.mesh.vertices)
     radius = truth["radius"]
-    values["translation_median"] = centre_error(poses, true_poses, photo, true_points, frame) / radius
+    values["translation_median"] = centre_error(poses, true_poses, photo, scale, own_middle, true_points) / radius
     values["surface_median"] = surface_error(poses, true_poses, photo, scale, frame, true_points[:: SAMPLES // 2000]) / radius
     own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
     values["chamfer"] = chamfer(true_points, own, frame)
@@ -239,15 +239,6 @@ def read_cameras(file: Path) -> list[tuple[str, Camera]]:
 # ---------------------------------------------------------------- poses
 
 
-def object_turn(poses: dict, true_poses: dict) -> np.ndarray:
-    """(3, 3) object_from_true_object: the turn of the object's frame that most registered instances agree on."""
-    turns = np.array([nearest_rotation(poses[k][:3, :3]).T @ nearest_rotation(true_poses[k][:3, :3]) for k in poses])
-    angles = np.array([[rotation_angle(a.T @ b) for b in turns] for a in turns])
-    middle = int(np.argmin(np.median(angles, axis=1)))
-    near = angles[middle] <= max(3 * float(np.median(angles[middle])), 1.0)
-    return nearest_rotation(turns[near].sum(0))
-
-
 def pose_figures(poses: dict, true_poses: dict, visible: dict) -> dict[str, float]:
     """rotation_median, rotation_worst, rotation_pairs and, where the visible shares are known, registered."""
     keys = [k for k in poses if k in true_poses]
@@ -279,66 +270,13 @@ def poses_before(run: Path, photo: Camera, labels: list[int]) -> dict[int, np.nd
     return {k: photo.world_from_camera @ np.linalg.inv(found[k]) for k in labels if k in found}
 
 
-def grown_about(centre: np.ndarray, scale: float) -> np.ndarray:
-    """(4, 4) scaling about a point."""
-    return similarity(np.eye(3), np.asarray(centre) * (1 - scale), scale)
-
-
 def scaled_ground(g: Ground, centre: np.ndarray, scale: float) -> Ground:
     return replace(g, point=move_points(grown_about(centre, scale), g.point), radius=g.radius * scale)
 
 
-def scene_alignment(poses: dict, true_poses: dict, photo: Camera, true_points: np.ndarray, asset: Asset) -> tuple[float, np.ndarray]:
-    """Scale about the camera that carries the recovered scene onto the true one, and object_from_true_object (4, 4) with the turn of
-    `object_turn`, refined between the surfaces (ICP)."""
-    turn = object_turn(poses, true_poses)
-    middle = (true_points.min(0) + true_points.max(0)) / 2
-    own = (asset.mesh.vertices.min(0) + asset.mesh.vertices.max(0)) / 2
-    size = np.ptp(asset.mesh.vertices, axis=0).max() / np.ptp(true_points, axis=0).max()
-    frame = similarity(turn, own - size * turn @ middle, size)
-    frame = icp(true_points[::10], asset.mesh.vertices.astype(np.float64), frame)
-    return scale_about(photo.centre, poses, true_poses, middle, move_points(frame, middle))[0], frame
-
-
-def scale_about(centre: np.ndarray, poses: dict, true_poses: dict, middle: np.ndarray, guess: np.ndarray) -> tuple[float, np.ndarray]:
-    """(scale, point (3,) of the recovered object's frame) with which the recovered scene, grown about the camera's `centre`, has its
-    objects' points where the true ones have their `middle`: linear least squares over the instances, with less weight for those that are
-    off. guess: (3,) of that point; it counts for little, but where there is one instance alone. Distances tell the scale far better
-    than sizes, a per cent of a distance is a tenth of an object; and the point follows from the poses, as the alignment of two surfaces
-    does not tell it well enough where one has thicker walls."""
-    keys = [k for k in poses if k in true_poses]
-    there = np.array([move_points(true_poses[k], middle) - centre for k in keys])
-    rows = np.stack([np.concatenate([(poses[k][:3, 3] - centre)[:, None], poses[k][:3, :3]], 1) for k in keys])
-    held = GUESSED * scale_of(poses[keys[0]]) * np.concatenate([-guess[:, None], np.eye(3)], 1)
-    weight = np.ones(len(keys))
-    for _ in range(20):
-        root = np.sqrt(weight)[:, None]
-        a, b = np.concatenate([(rows * root[..., None]).reshape(-1, 4), held]), np.append(there * root, np.zeros(3))
-        solved = np.linalg.lstsq(a, b, rcond=None)[0]
-        off = np.linalg.norm(rows @ solved - there, axis=1)
-        weight = 1 / (1 + np.square(off / max(float(np.median(off)), 1e-9)))
-    return float(solved[0]), solved[1:] / solved[0]
-
-
-def icp(source: np.ndarray, target: np.ndarray, start: np.ndarray, rounds: int = 30) -> np.ndarray:
-    """Similarity (4, 4) that carries points onto points, from `start`; nearest neighbours, the farthest tenth left out."""
-    from scipy.spatial import cKDTree
-
-    from relit.cameras.se3 import umeyama
-
-    tree, frame = cKDTree(target), start
-    for _ in range(rounds):
-        moved = move_points(frame, source)
-        distance, index = tree.query(moved)
-        keep = distance <= np.quantile(distance, 0.9)
-        frame = umeyama(source[keep], target[index[keep]])
-    return frame
-
-
-def centre_error(poses, true_poses, photo: Camera, true_points: np.ndarray, frame: np.ndarray) -> float:
-    middle = (true_points.min(0) + true_points.max(0)) / 2
-    scale, own = scale_about(photo.centre, poses, true_poses, middle, move_points(frame, middle))
-    grow = grown_about(photo.centre, scale)
+def centre_error(poses, true_poses, photo: Camera, scale: float, own: np.ndarray, true_points: np.ndarray) -> float:
+    """own: (3,) the point of the recovered object's frame that is the middle of the true one."""
+    middle, grow = (true_points.min(0) + true_points.max(0)) / 2, grown_about(photo.centre, scale)
     distances = [np.linalg.norm(move_points(grow @ poses[k], own) - move_points(true_poses[k], middle)) for k in poses if k in true_poses]
     return float(np.median(distances))
 

@@ -18,11 +18,20 @@ from relit.fit.lit_pile import LitPile, lit_pile, surface_options
 from relit.fit.loop import NoStage
 from relit.fit.mirrored import Symmetry
 from relit.fit.odd_instances import view_errors
-from relit.fit.outlines import follow_with_places
 from relit.fit.pile_photos import Scene
 from relit.fit.pile_scene import distance_in, find_ground, set_down
 from relit.fit.pixels import PixelBank
-from relit.fit.pose_passes import JOINT, followed, joint_stages, light_turns, motion_or_none, pose_rate, related, shape_and_poses
+from relit.fit.pose_passes import (
+    JOINT,
+    followed,
+    joint_stages,
+    light_turns,
+    motion_or_none,
+    placed_by_outlines,
+    pose_rate,
+    related,
+    shape_and_poses,
+)
 from relit.fit.sought_again import sought_again
 from relit.fit.turn_guess import others_of, turned_alike
 from relit.fit.vessel_trial import vessel_of
@@ -56,22 +65,21 @@ def shape_stages(
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
-        if rate > 0 and not arrived:
-            mesh, poses, _ = followed(mesh, views, poses, run, options)
-        telling = len(views)
+        if rate > 0:  # where poses have arrived, outlines and textures have had their say about their turns by the shape of the pass before
+            follow = placed_by_outlines if arrived else followed
+            mesh, poses, _ = follow(mesh, views, poses, run, options)
         if vague:
-            views, poses = [*views, *(v for v, _ in vague)], np.concatenate([poses, *(p[None] for _, p in vague)])
-        if rate > 0 and arrived:  # outlines and textures have had their say about the turns, by the shape of the pass before
-            mesh, poses = placed_by_outlines(mesh, views, poses, telling, options.outlines)
+            there, turned = [v for v, _ in vague], np.array([p for _, p in vague])
+            views, poses = [*views, *there], np.concatenate([poses, placed_by_outlines(mesh, there, turned, run, options, still=True)[1]])
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
         rows = row_features(model.grid)
         scene = related(views, poses)
-        turned = scene.motions if len(scene.motions) > 1 else [np.eye(4)]
+        to_first = scene.motions if len(scene.motions) > 1 else [np.eye(4)]
         seen = [
             instance_radiance(
-                model.grid, rows, model.reflections, mesh.vertices, mesh.normals, motion_or_none(turned[v.photo]) @ np.linalg.inv(p), k
+                model.grid, rows, model.reflections, mesh.vertices, mesh.normals, motion_or_none(to_first[v.photo]) @ np.linalg.inv(p), k
             )
             for k, (v, p) in enumerate(zip(views, poses, strict=True))
         ]
@@ -95,14 +103,6 @@ def shape_stages(
         }
         stage.save("mesh", **parts)
     return parts
-
-
-def placed_by_outlines(mesh: Mesh, views: list[View], poses: np.ndarray, telling: int, rounds: int) -> tuple[Mesh, np.ndarray]:
-    """(mesh, poses) as outlines have the mesh and where its instances stand, whose turns stay. telling: so many views, the first, move the
-    mesh; the others are placed by it."""
-    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-    masks, known = zip(*((v.mask, v.known) for v in views), strict=True)
-    return follow_with_places(mesh, cameras, masks, known, np.arange(len(views)) < telling, rounds)
 
 
 def parts_of(mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndarray]) -> dict[str, np.ndarray]:

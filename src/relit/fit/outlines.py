@@ -71,16 +71,16 @@ def follow_with_poses(mesh: Mesh, cameras: list[Camera], masks, known, rounds: i
     return mesh, np.array([c.world_from_camera for c in cameras])
 
 
-def follow_with_places(mesh: Mesh, cameras: list[Camera], masks, known, telling: np.ndarray, rounds: int = 3) -> tuple[Mesh, np.ndarray]:
-    """As `follow_with_poses` with the turns of the cameras as they are: they move along and across their lines of sight alone.
-    telling: (N,) bool, those by which the mesh moves; the others go where it has them."""
+def follow_with_places(mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3, still: bool = False) -> tuple[Mesh, np.ndarray]:
+    """As `follow_with_poses` with the turns of the cameras as they are: they move along and across their lines of sight alone. still: the
+    mesh stays as it is."""
     for _ in range(rounds):
         scene = build_geometry(mesh)
         for _ in range(2):
             found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
             cameras = [c.with_pose(placed(c, outline)) for c, outline in zip(cameras, found, strict=True)]
-        some = [(c, m, k) for c, m, k, tells in zip(cameras, masks, known, telling, strict=True) if tells]
-        mesh = moved(mesh, solve(mesh, [outline_of(mesh, scene, c, m, k) for c, m, k in some]))
+        if not still:
+            mesh = moved(mesh, solve(mesh, [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]))
     return mesh, np.array([c.world_from_camera for c in cameras])
 
 
