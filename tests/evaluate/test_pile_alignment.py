@@ -15,7 +15,7 @@ def piles(scale, count=10, along=0.0, seed=0):
     """True poses, and the recovered ones: nearer to the camera by the scale, in another frame of the object, and each with an error along
     its line of sight, a part of its distance."""
     rng = np.random.default_rng(seed)
-    true = {k: similarity(exp_so3(rng.normal(size=3)), CENTRE + [0, 0, 12] + rng.uniform(-3, 3, 3), 0.8) for k in range(count)}
+    true = {k: similarity(exp_so3(rng.normal(size=3)), CENTRE + np.array([0, 0, 12]) + rng.uniform(-3, 3, 3), 0.8) for k in range(count)}
     found = {k: grown_about(CENTRE, (1 + along * rng.normal()) / scale) @ p @ np.linalg.inv(FRAME) for k, p in true.items()}
     return found, true
 

@@ -261,7 +261,7 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     asked = []
 
     def passes(*told: tuple[float, float | None]):
-        """(poses, odd, arrived, symmetry), asked for passes which turn the instances by so many degrees, and leave textures so far off."""
+        """(poses, odd, arrived, the last pass), asked for passes which turn all by so many degrees, and leave textures so far off."""
         asked.clear()
 
         def stage(views, poses, number, run, options, seed, symmetry):
@@ -274,12 +274,13 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
         return pose_passes.joint_stages(["a", "b", "c"], start, None, None, 0)
 
     start = np.zeros((3, 4, 4))
-    poses, odd, arrived, symmetry = passes((2, 3.0), (2, 2.0), (0.1, 1.5))
+    poses, odd, arrived, last = passes((2, 3.0), (2, 2.0), (0.1, 1.5))
     assert asked == [["a", "b", "c"], ["a", "c"], ["a", "c"]]
     assert odd.tolist() == [False, True, False] and poses[:, 0, 0].tolist() == [3, 0, 3] and not start.any()
-    assert arrived and symmetry == 3
+    assert arrived and last.symmetry == 3 and not last.exact
     assert not passes((2, 3.0), (2, None))[2] and len(asked) == 2, "labels and textures agree"
-    assert passes((2, 3.0), (2, 0.2))[2] and len(asked) == 2, "textures lie on one another"
+    _, _, arrived, last = passes((2, 3.0), (2, 0.2))
+    assert arrived and last.exact and len(asked) == 2, "textures lie on one another"
     assert passes((2, 0.6), (2, 0.55))[2] and len(asked) == 2, "textures come no closer"
     assert not passes((2, 3.0), (2, 2.0), (2, 1.0), (2, 0.5))[2] and len(asked) == pose_passes.PASSES, "still on their way"
 

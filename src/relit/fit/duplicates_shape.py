@@ -60,17 +60,18 @@ def shape_stages(
     instance poses (K, 4, 4) object_from_first_photo, radiance (K, V, 3) and key (that of its first view); motions (P, 4, 4)
     first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related photos, and view_instances (N,) which of the
     instances it is; vague, keys of those whose turn about the axis is a guess."""
-    views, poses, model, arrived, vague = volume_stage(shots, views, poses, others, on_axes, run, options, seed)
+    views, poses, model, follow, vague = volume_stage(shots, views, poses, others, on_axes, run, options, seed)
     rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
-        if rate > 0:  # where poses have arrived, outlines and textures have had their say about their turns by the shape of the pass before
-            follow = placed_by_outlines if arrived else followed
+        if follow is not None:
             mesh, poses, _ = follow(mesh, views, poses, run, options)
         if vague:
             there, turned = [v for v, _ in vague], np.array([p for _, p in vague])
-            views, poses = [*views, *there], np.concatenate([poses, placed_by_outlines(mesh, there, turned, run, options, still=True)[1]])
+            if follow is not None:
+                _, turned, _ = placed_by_outlines(mesh, there, turned, run, options, still=True)
+            views, poses = [*views, *there], np.concatenate([poses, turned])
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
@@ -131,13 +132,17 @@ def volume_stage(
     options: DuplicatesOptions,
     seed: int,
 ):
-    """(views, poses, model, arrived: see `pose_passes.Pass`, vague) after the volume pass, from the poses of the first ones. Instances that
-    do not agree with their model are left out; they, and `others`, which the search could not place, are then sought in the finished
-    model. vague: (view, pose) of those whose axis alone is told, by `on_axes` (see `shape_stages`) or by the silhouette in the model."""
-    arrived, symmetry, vessel, vague = False, None, None, []
+    """(views, poses, model, follow, vague) after the volume pass, from the poses of the first ones. Instances that do not agree with their
+    model are left out; they, and `others`, which the search could not place, are then sought in the finished model. follow: what brings
+    mesh and poses to where outlines have them, `followed` or `placed_by_outlines`, or None where they stay. vague: (view, pose) of those
+    whose axis alone is told, by `on_axes` (see `shape_stages`) or by the silhouette in the model."""
+    arrived, symmetry, vessel, follow, vague = False, None, None, None, []
     before = {v.key: p for v, p in zip(views, poses, strict=True)}
     if pose_rate(views, options) > 0:
-        poses, odd, arrived, symmetry = joint_stages(views, poses, run, options, seed)
+        poses, odd, arrived, last = joint_stages(views, poses, run, options, seed)
+        symmetry, follow = last.symmetry, followed
+        if arrived:  # outlines and textures have had their say by the shape of the pass before; where they agree, this one may follow both
+            follow = placed_by_outlines if last.exact else None
         others = [*others, *(views[k] for k in np.flatnonzero(odd))]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
         vessel = vessel_stage(shots, views, poses, symmetry, run, options, seed)
@@ -147,7 +152,7 @@ def volume_stage(
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
             on_axes = carried(on_axes, np.array([before[v.key] for v in views]), poses)
             views, poses, vague = with_found(views, poses, others, on_axes, model, bank, run, seed)
-        return views, poses, model, arrived, vague
+        return views, poses, model, follow, vague
 
 
 def vessel_stage(

@@ -49,17 +49,22 @@ class Pass:
     off: float | None
     symmetry: Symmetry | None
 
+    @property
+    def exact(self) -> bool:
+        """Whether textures lie on one another as closely as flow can tell."""
+        return self.off is not None and self.off < CLOSE
+
     def arrived(self, last: Pass | None) -> bool:
         """Whether another one would only lead the poses away again: textures brought them back to where they had been before, or as close
         together as flow can tell, or hardly closer than in the pass before."""
         if self.off is None:
             return False
         settled = last is not None and last.off is not None and self.off > CLOSER * last.off
-        return settled or self.turn < ARRIVED or self.off < CLOSE
+        return settled or self.turn < ARRIVED or self.exact
 
 
 def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool, arrived: see `Pass`, symmetry or None) after a first volume pass, and others while textures say that poses are
+    """(poses, odd (N,) bool, arrived: see `Pass`, the last pass) after a first volume pass, and others while textures say that poses are
     still on their way (at most PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with
     the model of all. A shape that grew up with better poses is sharper, and moves them on."""
     poses, odd, last, arrived = poses.copy(), np.zeros(len(views), bool), None, False
@@ -70,7 +75,7 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
         last, arrived = one, one.arrived(last)
         if arrived or one.off is None:
             break
-    return poses, odd, arrived, last.symmetry
+    return poses, odd, arrived, last
 
 
 def joint_stage(
