@@ -90,7 +90,7 @@ def shape_stages(
         if len(plane) and rate > 0 and len(scene.motions) == 1:
             poses, plane, count = set_down(mesh.vertices, poses, plane, distance_in(values))
             if count:
-                run.say(f"{count} instances were moved along their lines of sight onto the ground, or onto what they rest on")
+                run.say(f"{count} instances were moved along their lines of sight towards the ground, or what they rest on")
         if len(plane) == 0:
             run.say("note: no ground was found that the instances stand on; nothing but they themselves casts shadows")
         parts |= {

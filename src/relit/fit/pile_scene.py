@@ -93,7 +93,7 @@ def set_down(vertices: np.ndarray, poses: np.ndarray, plane: np.ndarray, distanc
             if gaps[k] > TOUCHES:
                 onto = resting_share(points, standing, k, placed, distance, ground)
                 share, most = ONTO * onto, ONTO * BESIDE
-            if abs(share) < most:
+            if 0 < abs(share) < most:
                 standing[k][:3, 3] += share * ray
                 count += 1
         placed.append(k)
