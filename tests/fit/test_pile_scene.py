@@ -65,7 +65,7 @@ def test_what_lies_deep_in_the_ground_is_lifted_and_what_floats_over_another_com
     shift[3], shift[9], shift[10] = 0.015, -0.004, 0.004
     seen = np.array([np.linalg.inv(similarity(turn, p * (1 + e))) for p, e in zip(at, shift, strict=True)])
     poses, _, count = set_down(vertices, seen, np.stack([[0, 0, 10.0], UP]), from_ball)
-    assert count == len(at)
+    assert count == 3  # the others are where they belong
     for k, p in enumerate(poses):
         part = ONTO if k > 8 else 1.0  # of the way
         expected = true[k][:3, 3] * (1 + (1 - part) * shift[k])
