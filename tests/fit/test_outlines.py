@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from relit.cameras.se3 import exp_so3
-from relit.fit.outlines import Outline, follow_outlines, follow_with_places, follow_with_poses, laplacian, outline_of, solve, trace
+from relit.fit.outlines import Outline, follow_outlines, follow_with_poses, laplacian, outline_of, solve, trace
 from relit.geometry.tangents import vertex_normals
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
@@ -129,7 +129,7 @@ def test_places_follow_and_turns_stay(seen):
         step[:3, :3] = exp_so3(np.radians([0.0, 0.0, 2.0])) if k == 0 else np.eye(3)
         off.append(c.with_pose(c.world_from_camera @ step))
     known = [np.ones_like(m) for m in masks]
-    mesh, poses = follow_with_places(ball(0.505), off, masks, known, 4)
+    mesh, poses = follow_with_poses(ball(0.505), off, masks, known, 4, turning=False)
     size = np.linalg.norm(mesh.vertices, axis=1).mean() / 0.5  # all together may be nearer to a smaller object
 
     def off_by(poses):
@@ -139,5 +139,5 @@ def test_places_follow_and_turns_stay(seen):
     assert size == pytest.approx(1, abs=0.02)
     assert np.median(before) > 0.025 and np.median(after) < 0.25 * np.median(before)
     assert all(np.array_equal(p[:3, :3], o.world_from_camera[:3, :3]) for p, o in zip(poses, off, strict=True))
-    same, there = follow_with_places(mesh, off[:4], masks[:4], known[:4], 4, still=True)
+    same, there = follow_with_poses(mesh, off[:4], masks[:4], known[:4], 4, turning=False, still=True)
     assert same is mesh and np.abs(there - poses[:4])[:, :3, 3].max() < 0.004

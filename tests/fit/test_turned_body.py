@@ -1,5 +1,7 @@
 """Bodies of revolution: what an outline rules out on one side is ruled out all around, and handles stay."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -64,8 +66,6 @@ def test_circles_are_as_wide_as_the_body(seen):
 
 def test_nothing_goes_that_no_view_rules_out(seen):
     """Views that know nothing but what they show of the object itself."""
-    from dataclasses import replace
-
     views = [replace(v, known=v.mask) for v in seen[0]]
     start = distance_of(solid(N, True))
     assert turned_body(start, UP, views, seen[1]) is start

@@ -59,53 +59,33 @@ def follow_outlines(mesh: Mesh, cameras: list[Camera], masks: list[np.ndarray], 
     return mesh
 
 
-def follow_with_poses(mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3) -> tuple[Mesh, np.ndarray]:
+def follow_with_poses(
+    mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3, turning: bool = True, still: bool = False
+) -> tuple[Mesh, np.ndarray]:
     """As `follow_outlines`, with the poses of the cameras (N, 4, 4) moved too, each round before the mesh. known: (H, W) each, 1 where what
-    the mask says counts."""
+    the mask says counts. turning: False where the cameras move along and across their lines of sight alone. still: the mesh stays."""
     for _ in range(rounds):
         scene = build_geometry(mesh)
         for _ in range(2):
             found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
-            cameras = [c.with_pose(turned(c, outline)) for c, outline in zip(cameras, found, strict=True)]
-        mesh = moved(mesh, solve(mesh, [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]))
-    return mesh, np.array([c.world_from_camera for c in cameras])
-
-
-def follow_with_places(mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3, still: bool = False) -> tuple[Mesh, np.ndarray]:
-    """As `follow_with_poses` with the turns of the cameras as they are: they move along and across their lines of sight alone. still: the
-    mesh stays as it is."""
-    for _ in range(rounds):
-        scene = build_geometry(mesh)
-        for _ in range(2):
-            found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
-            cameras = [c.with_pose(placed(c, outline)) for c, outline in zip(cameras, found, strict=True)]
+            cameras = [c.with_pose(moved_camera(c, outline, turning)) for c, outline in zip(cameras, found, strict=True)]
         if not still:
             mesh = moved(mesh, solve(mesh, [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]))
     return mesh, np.array([c.world_from_camera for c in cameras])
 
 
-def placed(camera: Camera, outline: Outline) -> np.ndarray:
-    """As `turned`, by translations alone."""
-    if len(outline.point) < 30:
-        return np.asarray(camera.world_from_camera, np.float64)
-    rows, trust = by_motion(camera, outline, outline.point.mean(0))[:, 3:], precision(outline.shift)
-    normal = (rows * trust[:, None]).T @ rows
-    normal += 1e-6 * np.diag(np.diag(normal))
-    step = np.linalg.solve(normal, rows.T @ (trust * outline.shift))
-    return after_motion(camera, np.concatenate([np.zeros(3), step]), np.zeros(3))
-
-
-def turned(camera: Camera, outline: Outline) -> np.ndarray:
+def moved_camera(camera: Camera, outline: Outline, turning: bool = True) -> np.ndarray:
     """The camera's pose (4, 4) with which the outline moves as its samples ask for: one Gauss-Newton step over turns about the middle of
-    what is seen, and translations."""
+    what is seen, unless turning is False, and translations."""
     if len(outline.point) < 30:
         return np.asarray(camera.world_from_camera, np.float64)
-    middle = outline.point.mean(0)
-    rows = by_motion(camera, outline, middle)
-    trust = precision(outline.shift)
+    middle, free = outline.point.mean(0), slice(0 if turning else 3, 6)
+    rows, trust = by_motion(camera, outline, middle)[:, free], precision(outline.shift)
     normal = (rows * trust[:, None]).T @ rows
     normal += 1e-6 * np.diag(np.diag(normal))
-    return after_motion(camera, np.linalg.solve(normal, rows.T @ (trust * outline.shift)), middle)
+    step = np.zeros(6)
+    step[free] = np.linalg.solve(normal, rows.T @ (trust * outline.shift))
+    return after_motion(camera, step, middle)
 
 
 def by_motion(camera: Camera, outline: Outline, middle: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ BESIDE = 0.005  # the same for what is moved onto another instance, or from fart
 ONTO = 0.35  # of that way that it goes: its size tells its distance to .035 radii, touching another to .05, as few see the undersides
 TILT = 5.0  # degrees that the ground may turn meanwhile
 PLANE = 0.009  # unit lengths, the standard deviation of a distance that the ground tells: neither feet nor the plane are exact
-FAR = 3.0
+FAR = 3.0  # standard deviations
 STEEP = 0.3  # sine of the angle at which the photo must look down on the ground for objects to be moved onto something
 GROUND_ROWS = 96
 ROOM = 40.0  # unit lengths between instances that are to stand alone: one fills a ten-thousandth of what its neighbour sees
@@ -105,8 +105,8 @@ def parts_of_the_way(ways: np.ndarray, stands: np.ndarray) -> np.ndarray:
 
     Each has been measured twice, by its size and by the ground, and goes to the mean of both, each by the inverse of its variance: the
     ground's is PLANE², and what the ways scatter is that of both. Whose way is FAR times as long was not measured by its size."""
-    spread = max(1.48 * float(np.median(np.abs(ways[stands]))), PLANE) if stands.any() else PLANE
-    return 1 - (PLANE / np.where(np.abs(ways) > FAR * spread, np.abs(ways), spread)) ** 2
+    scatter = max(1.48 * float(np.median(np.abs(ways[stands]))), PLANE) if stands.any() else PLANE
+    return 1 - (PLANE / np.where(np.abs(ways) > FAR * scatter, np.abs(ways), scatter)) ** 2
 
 
 def resting_share(points: np.ndarray, standing: np.ndarray, k: int, placed: list[int], distance: Distance, ground: float) -> float:

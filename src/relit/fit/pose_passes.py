@@ -19,7 +19,7 @@ from relit.fit.instances import View, carved, hold_distances, move_poses, moved_
 from relit.fit.joint_alignment import follow_views
 from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
 from relit.fit.odd_instances import odd_instances
-from relit.fit.outlines import follow_with_places, follow_with_poses
+from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import NoShape
@@ -132,7 +132,7 @@ def placed_by_outlines(
     """As `followed`, by outlines alone and with the turns of the poses as they are; textures are not asked. still: the mesh stays too."""
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
     masks, known = zip(*((v.mask, v.known) for v in views), strict=True)
-    return *follow_with_places(mesh, cameras, masks, known, options.outlines, still), None
+    return *follow_with_poses(mesh, cameras, masks, known, options.outlines, turning=False, still=still), None
 
 
 def shape_and_poses(
