@@ -4,6 +4,7 @@ The table PARAMETERS is the list: a new learnable parameter gets its line here.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +14,7 @@ from lump import lump
 
 from relit.cameras.se3 import look_at
 from relit.conventions import environment_directions
+from relit.fit.lit_pile import TOE
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank
 from relit.fit.surface import SurfaceOptions, common_scale, dual_loss, light_prior, material_prior, neighbours, parsimony, slope_prior
@@ -32,10 +34,34 @@ PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
     "background": (("volume",), 1e-2),
     "rotations": (("matt", "saddle"), 1e-4),
     "translations": (("matt", "saddle"), 2e-4),
-    "colour": (("surface",), 1e-3),
-    "metallic": (("surface",), 1e-3),
-    "slope": (("surface",), 1e-3),
-    "log_light": (("surface",), 2e-3),
+    "colour": (
+        (
+            "surface",
+            "pile",
+        ),
+        1e-3,
+    ),
+    "metallic": (
+        (
+            "surface",
+            "pile",
+        ),
+        1e-3,
+    ),
+    "slope": (
+        (
+            "surface",
+            "pile",
+        ),
+        1e-3,
+    ),
+    "log_light": (
+        (
+            "surface",
+            "pile",
+        ),
+        2e-3,
+    ),
 }
 N, SIZE, VIEWS = 16, 10, 4
 ROUND = ([2.5, 0.3, 0.2], [-1, 2, 1], [0.2, -0.8, 2.4], [0.4, 1.5, -2])
@@ -119,9 +145,9 @@ class VolumeScene:
 class SurfaceScene:
     """The surface pass's loss for fixed points, directions, visibility and neighbours: two estimates against the photo, all priors."""
 
-    def __init__(self):
+    def __init__(self, **options):
         rng = np.random.default_rng(1)
-        self.options = SurfaceOptions(texture=8, light=6, smooth_colour=0.2, light_even=0.02)
+        self.options = SurfaceOptions(texture=8, light=6, smooth_colour=0.2, light_even=0.02, **options)
         mesh, _ = lump()
         self.mesh = TraceableMesh(mesh, rng.uniform(0.1, 0.6, mesh.vertices.shape))
         self.field = start_material(8, rng.uniform(0.1, 0.8, (8, 8, 3)), 0.45, 0.3)
@@ -135,6 +161,8 @@ class SurfaceScene:
         self.close = neighbours(self.mesh, self.points, 0.05, lanes)
         colour = np.array(self.field.colour).reshape(-1, 4)
         colour[:, 3] = rng.uniform(0.3, 0.7, len(colour))
+        if self.options.scale_power == 1:
+            colour[rng.random(len(colour)) < 0.85, 2] = 0.02  # a channel in which most is black
         d = environment_directions(6, 12)
         self.start = {
             "colour": colour.astype(np.float32).ravel(),
@@ -175,7 +203,11 @@ class SurfaceScene:
         return fit + prior + light_prior(x["log_light"], self.options)
 
 
-SCENES = {"surface": SurfaceScene} | {kind: lambda k=kind: VolumeScene(k) for kind in ("volume", "matt", "saddle")}
+SCENES = {
+    "surface": SurfaceScene,
+    "pile": lambda: SurfaceScene(scale_power=1.0, parsimony_toe=TOE),
+    **{kind: lambda k=kind: VolumeScene(k) for kind in ("volume", "matt", "saddle")},
+}
 
 
 @pytest.fixture(scope="module")
@@ -240,3 +272,34 @@ def test_darkening_everything_is_little_reward(scenes, darker):
 
     expected = np.mean(np.sqrt(darker)) * smoothness(grey)
     assert smoothness(grey * np.float32([*darker, 1])) == pytest.approx(expected, rel=1e-3) and expected > 0
+
+
+@pytest.mark.parametrize("mean", [0.05, 0.5])
+def test_a_veil_over_what_is_mostly_black_is_no_reward(mean):
+    """Where a channel's colours differ by more than their mean, its factor in the priors is what it was under a grey veil, and what the
+    channel is multiplied by divides it; elsewhere the mean alone counts."""
+    base = np.random.default_rng(0).permutation(np.where(np.arange(1000) < 1000 * mean, 1.0, 0.0)).astype(np.float32)
+    valid = dr.full(mi.Bool, True, len(base))
+
+    def factor(c):
+        return float(common_scale(SimpleNamespace(base=mi.Color3f(mi.Float(c))), valid, 1.0).x[0])
+
+    assert factor(base + 0.03) == pytest.approx(factor(base), rel=1e-3)
+    assert factor(0.5 * base) == pytest.approx(2 * factor(base), rel=1e-3)
+    assert factor(0.1 * base + 0.5) == pytest.approx(0.4 / (0.1 * base + 0.5).mean(), rel=1e-3)
+
+
+def test_black_that_is_noisy_attracts_itself_without_a_veil():
+    """By `parsimony` of a pile; without its toe a veil of .03 would pay."""
+    noise = np.abs(np.random.default_rng(0).normal(0, 0.004, (16, 16, 3))).astype(np.float32)
+    uv = mi.Point2f(*np.random.default_rng(1).uniform(0, 1, (2, 512)).astype(np.float32))
+
+    def cost(veil, toe):
+        field = start_material(16, noise + np.float32(veil), 0.4, 0.0)
+        o = SurfaceOptions(scale_power=1.0, parsimony_toe=toe)
+        valid = dr.full(mi.Bool, True, 512)
+        surface = material_at(field, uv, valid)
+        return float(parsimony(field, surface, uv, valid, mi.Color3f(1.0), mi.UInt32(7), o)[0])
+
+    assert cost(0.03, 0.0) < cost(0.0, 0.0) - 0.05 * SurfaceOptions().parsimony
+    assert abs(cost(0.03, TOE) - cost(0.0, TOE)) < 0.02 * SurfaceOptions().parsimony

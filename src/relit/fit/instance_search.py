@@ -18,7 +18,7 @@ from relit.fit.instance_growth import grow, linked_pose
 from relit.fit.instance_guesses import Guesses, first_pairs, pair_guesses
 from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
-from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged
+from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged
 from relit.fit.instance_revolution import mostly_sure, place_revolved
 from relit.fit.instance_rounds import settled
 from relit.fit.instances import View, best_seen, crops_of, first_pose, frame_scale
@@ -158,6 +158,6 @@ def grown_from_pairs(
                 f"grown from {' and '.join(str(views[k].label) for k in start)}: {len(views) - len(placed.unsure)} sure of their places, "
                 f"agreement of all with a model of all {placed.agreement:.3f}"
             )
-            if best is None or believed(placed, o) or placed.agreement > best.agreement:
+            if best is None or placed.agreement > best.agreement - (NO_GAIN if believed(placed, o) else 0):
                 best = placed
     return best

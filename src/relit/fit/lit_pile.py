@@ -16,6 +16,8 @@ from relit.geometry.mesh import vertex_areas
 from relit.rendering.transport import TraceableMesh
 from relit.scene import Camera, Mesh
 
+TOE = 0.05  # of parsimony
+
 
 @dataclass(frozen=True)
 class LitPile:
@@ -32,7 +34,7 @@ class LitPile:
 
 def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
     off = {"metallic_binary": 0.0, "metallic_sparse": 0.0} if "metal" in o.without else {}
-    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, scale_power=1.0, **off)
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, scale_power=1.0, parsimony_toe=TOE, **off)
 
 
 def lit_pile(shots, camera: Camera, mesh: Mesh, parts, max_pixels: int, *, alone: bool = False) -> LitPile:

@@ -34,7 +34,8 @@ TRIES = 12  # places of an instance that are tried, half of them under each desc
 APART = 12.0
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
-OUTLINE = 0.95  # overlap of silhouettes from which on a place of a body of revolution is right up to a turn about the axis
+OUTLINE = 0.95  # overlap of silhouettes from which on a place of a body of revolution is right up to a turn about the axis,
+AS_WELL = 2.0  # where what it leaves over is at most so many times what the best place leaves
 TURNS = 24  # about an axis that is known
 ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
@@ -89,8 +90,9 @@ def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.n
 
 
 def where_outlines_agree(errors: np.ndarray, view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
-    """The errors (K,) of places whose silhouettes agree with the view's, nan for others."""
-    return np.where(overlaps(view, poses, model) >= OUTLINE, errors, np.nan)
+    """The errors (K,) of places whose silhouettes agree with the view's, and about as well as the best of them, nan for others."""
+    left = 1 - overlaps(view, poses, model)
+    return np.where(left <= min(1 - OUTLINE, AS_WELL * left.min()), errors, np.nan)
 
 
 def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:

@@ -25,6 +25,7 @@ from relit.materials.field import MaterialField, material_at, nearest_texel, pro
 from relit.rendering.transport import Points, TraceableMesh, bent_normal, first_hits, reflected, sample_lights
 
 ALBEDO_START = 0.4  # mean base colour at the start; light and albedo share one unknown scale
+VARIED = 2.0  # see `common_scale`
 WHITE = 0.8  # base colour of white paint and paper; what would have to be brighter rather stands in more light
 
 
@@ -40,10 +41,10 @@ class SurfaceOptions:
     similarity_width in base colour; smooth_shade: power of `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary,
     metallic_sparse: of m (1 - m), and of the distance of m from the side that a place began on, 0 or 1. bright: of base colour beyond
     WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma; light_even: its squared distance from its
-    mean. light_steps: after them the light rests, and `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width:
-    see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves. slope_small, slope_smooth:
-    weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser (see `Adam`), so that noise
-    does not move it at full rate.
+    mean. light_steps: after them the light rests, and `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width,
+    parsimony_toe: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves.
+    slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser
+    (see `Adam`), so that noise does not move it at full rate.
     """
 
     steps: int = 700
@@ -76,6 +77,7 @@ class SurfaceOptions:
     scale_power: float = 0.5
     parsimony: float = 0.02
     parsimony_width: float = 0.1
+    parsimony_toe: float = 0.0
     slope_rate: float = 0.01
     slope_begin: float = 0.25
     slope_small: float = 0.02
@@ -297,15 +299,21 @@ def brightness(rgb, base, valid, power: float):
 
 def common_scale(surface, valid, power: float = 0.5):
     """Factor on the base colours of the valid points in priors: (ALBEDO_START / their mean) ** power for each channel (Color3f of width 1),
-    with its gradient.
+    with its gradient; for the power 1 in the place of the mean what they differ by, VARIED times their mean distance from it, where that
+    is more.
 
     Differences themselves shrink when everything darkens, and the light would brighten without end; relative differences shrink when a
     grey veil is laid over everything, and the light would dim. In between, as differences of display values do, they pull neither way.
     One factor for all channels would let the least visible ones go dark, under a tinted light. power: 1 is right where each texel stands
-    in many places and a veil would show (a photo of duplicates).
+    in many places and a veil would show (a photo of duplicates), but in a channel in which most of an object is black: there a veil is
+    faint and its mean grows many times with it, while what its colours differ by stays.
     """
     w = dr.select(valid, mi.Float(1), 0)
-    return mi.Color3f(*[(ALBEDO_START / dr.maximum(weighted_mean(c, w), 1e-3)) ** power for c in surface.base])
+    typical = []
+    for c in surface.base:
+        mean = weighted_mean(c, w)
+        typical.append(dr.maximum(mean, VARIED * weighted_mean(dr.abs(c - mean), w)) if power == 1 else mean)
+    return mi.Color3f(*[(ALBEDO_START / dr.maximum(c, 1e-3)) ** power for c in typical])
 
 
 def material_prior(material: MaterialField, surface, near: Points, valid, level, options: SurfaceOptions, colour_smoothing, side=0.0):
@@ -332,12 +340,13 @@ def material_prior(material: MaterialField, surface, near: Points, valid, level,
 def parsimony(material: MaterialField, surface, uv, valid, level, shift, options: SurfaceOptions):
     """An object has few materials (Barron & Malik 2015, Sec. 4.2): pairs of points anywhere on it attract each other's display value of
     base colour when they are closer than about parsimony_width. level: `common_scale`. shift: opaque UInt32, how far the partner of a
-    point is in the batch."""
+    point is in the batch. parsimony_toe is added to what is displayed: noise in a channel that is black is large in display values, and
+    would look less different under a grey veil."""
     n = dr.width(uv)
     partner = (dr.arange(mi.UInt32, n) + shift) % n
     uv, valid = dr.gather(mi.Point2f, uv, partner), valid & dr.gather(mi.Bool, valid, partner)
     other = material_at(material, uv, valid)
-    shown = lambda c: dr.maximum(c * level, 1e-3) ** (1 / 2.2)  # noqa: E731
+    shown = lambda c: (dr.maximum(c * level, 1e-3) + options.parsimony_toe) ** (1 / 2.2)  # noqa: E731
     alike = dr.exp(-dr.squared_norm(mi.Vector3f(shown(other.base) - shown(surface.base))) / (2 * options.parsimony_width**2))
     return -options.parsimony * dr.mean(dr.select(valid, alike, 0))
 

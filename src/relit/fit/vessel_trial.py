@@ -20,7 +20,6 @@ from relit.fit.lit_pile import LitPile
 from relit.fit.loop import NoStage
 from relit.fit.pixels import saturated_at
 from relit.fit.surface import SurfaceModel, SurfaceOptions, drawn_points, dual_values, fit_surface, start_surface
-from relit.fit.turned_body import turned_body
 from relit.fit.vessels import End, body_axis, ends_of, hollowed, mouths
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import rasterise_atlas
@@ -49,19 +48,18 @@ def vessel_of(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> np.ndarray | None:
-    """Distances of a body of revolution as narrow all around as its silhouettes say, with its ends cut off square, and hollow under each
-    end that is a mouth; None where it is no such body, or is all that already. values: (n, n, n) of the shape so far. lit: the pile of
-    instances of a mesh. options: of the surface pass."""
+    """Distances of a body of revolution with its ends cut off square, and hollow under each end that is a mouth; None where it is none, or
+    its ends are as they should be. values: (n, n, n) of the shape so far. lit: the pile of instances of a mesh. options: of the
+    surface pass."""
     axis = body_axis(extract_mesh(values))
     if axis is None:
         return None
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-    body = turned_body(values, axis, views, cameras)
-    flat, ends = ends_of(body, axis, views, cameras)
+    flat, ends = ends_of(values, axis, views, cameras)
     o = replace(options, steps=min(STEPS, options.steps // 2), **TRIAL)
     best, stage = flat, NoStage(progress)
     for end in mouths(flat, axis, ends):
-        hollows = [hollowed(body, best, axis, end, raised) for raised in FLOORS]
+        hollows = [hollowed(values, best, axis, end, raised) for raised in FLOORS]
         if any(h is None for h in hollows):
             continue
         closed = Body.of(best, lit, o)
@@ -78,7 +76,7 @@ def vessel_of(
                 break
         else:
             say(f"the object is hollow under one end: the error of the photos there falls to {min(changes):.0%}")
-            best = hollowed(body, best, axis, end, lowest_of(changes))
+            best = hollowed(values, best, axis, end, lowest_of(changes))
     return redistance(best) if (best > values).any() else None
 
 
