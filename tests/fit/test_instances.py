@@ -12,11 +12,12 @@ from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
 from relit.fit.instance_growth import ANOTHER, Grown, grow, lead, linked_poses
 from relit.fit.instance_guesses import Guesses, first_pairs
+from relit.fit.instance_links import linked_sets
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Growth, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged, staying
 from relit.fit.instance_rounds import LOW, ambiguous, crops_of, nearer, reconsider, regrown, settled, trusted
-from relit.fit.instance_search import first_starts, linked_sets, place
+from relit.fit.instance_search import first_starts, place
 from relit.fit.instances import (
     albedo_render,
     carved,

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relit.cameras.se3 import rotation_angle
-from relit.fit.instance_growth import grow, linked_pose
+from relit.fit.instance_growth import grow
 from relit.fit.instance_guesses import Guesses, first_pairs, pair_guesses
+from relit.fit.instance_links import borne_out, linked_sets
 from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged
@@ -26,7 +26,6 @@ from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
 
-ALIKE = 15.0  # degrees within which links tell the same turn
 LEFT_OUT = -2.0  # score of an instance whose turn about a known axis is not told; that of a place that shows nothing is -1
 
 
@@ -50,7 +49,7 @@ def first_starts(views, crops, rings: Rings, parts, guesses: Guesses, chosen: li
         pair = [chosen[s], j]
         poses[pair] = guesses.poses[s, pair, 0]
         guessed.append((pair, poses))
-    told = linked_sets(views, links, distance)[: o.pairs]
+    told = [borne_out(views, crops, rings, parts, one, links, o.growth, seed) for one in linked_sets(views, links, distance)[: o.pairs]]
     value = branch_values(views, crops, rings, parts, [*guessed, *told], o.growth, seed, flipped_views(views, parts))
     order = np.argsort(-value, kind="stable").tolist()
     kinds = [b >= len(guessed) for b in order]
@@ -58,27 +57,6 @@ def first_starts(views, crops, rings: Rings, parts, guesses: Guesses, chosen: li
         other = order[kinds.index(not kinds[0])]
         order = [order[0], other, *(b for b in order[1:] if b != other)]
     return [[*guessed, *told][b] for b in order]
-
-
-def linked_sets(views, links, distance: float) -> list[Branch]:
-    """Sets of instances that links of matching join, the largest first: each begins with a link, and who joins has links to two members
-    or more that tell the same turn. A link whose instances a set holds is not begun from again."""
-    either = [*links, *((j, i, turn.T) for i, j, turn in links)]
-    sets: list[Branch] = []
-    for first, second, turn in links:
-        if any({first, second} <= set(members) for members, _ in sets):
-            continue
-        poses = np.tile(np.eye(4), (len(views), 1, 1))
-        poses[first] = first_pose(views[first], distance)
-        poses[second] = linked_pose(views[second], poses[first], turn, distance)
-        members = [first, second]
-        for k in range(len(views)):
-            ways = [linked_pose(views[k], poses[i], r, distance) for i, j, r in either if j == k and i in members and k not in members]
-            if len(ways) > 1 and all(rotation_angle(ways[0][:3, :3].T @ w[:3, :3]) < ALIKE for w in ways[1:]):
-                poses[k] = ways[0]
-                members.append(k)
-        sets.append((members, poses))
-    return sorted(sets, key=lambda one: -len(one[0]))
 
 
 def by_axes(revolved: Placed, say) -> Found:
