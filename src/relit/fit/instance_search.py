@@ -2,6 +2,7 @@
 
 place_revolved bodies of revolution, by their outlines and their decoration (fit/instance_revolution.py); all others go on as follows
 pair_guesses   every instance's silhouette is inflated to a crude model, and every other one registered against it (fit/instance_guesses.py)
+borne_out      what matching has linked, as far as silhouettes and paint bear it out (fit/instance_links.py)
 grow           one instance after another joins those that stand already (fit/instance_growth.py); from several pairs, the best counts
 improved       where instances were not sure of their places: taken out and grown again, another way each time (fit/instance_regrowth.py)
 settled        rounds of a coarse model of all and a search for all poses by rendering it, descents, doubt (fit/instance_rounds.py)
