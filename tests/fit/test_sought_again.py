@@ -129,3 +129,13 @@ def test_poses_are_carried_along_with_those_that_passes_have_moved():
     after = np.array([similarity(turn @ p[:3, :3], 1.2 * turn @ p[:3, 3] + [0.1, 0.2, -0.3]) for p in before])
     there = carried({7: before[5]}, before[:5], after[:5])
     assert np.allclose(there[7], after[5])
+
+
+@pytest.mark.parametrize(
+    "shared, there", [([0.99, 0.986, 0.96], [1, 1, 0]), ([0.96, 0.951, 0.93], [1, 1, 0]), ([0.94, 0.93, 0.9], [0, 0, 0])]
+)
+def test_places_count_whose_silhouettes_agree_about_as_well_as_the_best(monkeypatch, shared, there):
+    """What is in the wrong place by a fifth of its radius can still overlap by .95, and agree in colour by chance."""
+    monkeypatch.setattr(module, "overlaps", lambda view, poses, model: np.array(shared))
+    found = module.where_outlines_agree(np.array([3.0, 2.0, 1.0]), None, None, None)
+    assert np.array_equal(np.isfinite(found), np.array(there, bool))
