@@ -34,34 +34,10 @@ PARAMETERS = {  # name: (scenes whose loss moves it, step of the difference)
     "background": (("volume",), 1e-2),
     "rotations": (("matt", "saddle"), 1e-4),
     "translations": (("matt", "saddle"), 2e-4),
-    "colour": (
-        (
-            "surface",
-            "pile",
-        ),
-        1e-3,
-    ),
-    "metallic": (
-        (
-            "surface",
-            "pile",
-        ),
-        1e-3,
-    ),
-    "slope": (
-        (
-            "surface",
-            "pile",
-        ),
-        1e-3,
-    ),
-    "log_light": (
-        (
-            "surface",
-            "pile",
-        ),
-        2e-3,
-    ),
+    "colour": (("surface", "pile"), 1e-3),
+    "metallic": (("surface", "pile"), 1e-3),
+    "slope": (("surface", "pile"), 1e-3),
+    "log_light": (("surface", "pile"), 2e-3),
 }
 N, SIZE, VIEWS = 16, 10, 4
 ROUND = ([2.5, 0.3, 0.2], [-1, 2, 1], [0.2, -0.8, 2.4], [0.4, 1.5, -2])

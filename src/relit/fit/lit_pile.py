@@ -16,7 +16,7 @@ from relit.geometry.mesh import vertex_areas
 from relit.rendering.transport import TraceableMesh
 from relit.scene import Camera, Mesh
 
-TOE = 0.05  # of parsimony
+TOE = 0.05  # see `surface.parsimony`
 
 
 @dataclass(frozen=True)
