@@ -2,8 +2,9 @@
 
 The silhouette of a body of revolution tells all but that turn, and one that is mostly hidden may have been placed by it alone. A pattern
 matches itself within a few degrees, and only where the axis is right too. So the evidence of all turns names a few places (`agreement`),
-each of these descends by what the others show and by its outline (one Gauss-Newton step of `fit.joint_alignment` after another, for the
-pose of this view alone), and of where they end the one is taken at which the pictures are most likely of the same thing (`likelihood`).
+each of these is laid on its outline and descends then by what the others show too (one Gauss-Newton step of `fit.joint_alignment` after
+another, for the pose of this view alone): textures that are met from an axis that leans by two degrees would hold it there. Of where they
+end the one is taken at which the pictures are most likely of the same thing (`likelihood`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
 from relit.fit.instances import View
 from relit.fit.joint_alignment import LABELS, outline_rows, settled, solved, texture_rows
+from relit.fit.outlines import follow_with_poses
 from relit.fit.texture_shifts import (
     ACROSS,
     NEIGHBOURS,
@@ -41,7 +43,7 @@ from relit.scene import Camera, Mesh
 
 TURNS = 120  # that are compared
 PLACES = 8  # that descend
-ROUNDS = 8  # of their descent
+OUTLINED, ROUNDS = 4, 8  # rounds of their descent: by outlines alone, then by both
 ASTRAY = 3.0  # degrees by which the axis leans after a descent that was led astray: the silhouette had told it better
 EXPECTED = 0.6  # correlation of what two views show of the same place: of views at their true poses .4 to .7
 
@@ -79,9 +81,9 @@ def turned_alike(others: Others, view: View, pose: np.ndarray, axis: Axis) -> np
     turns = all_turns(pose, axis, TURNS)
     evidence = agreement(others, view, turns)
     peaks = np.flatnonzero((evidence >= np.roll(evidence, 1)) & (evidence >= np.roll(evidence, -1)))
-    best = peaks[np.argsort(-evidence[peaks])[:PLACES]]
-    ends = [descended_alike(others, view, turns[k]) for k in best]
-    ends = [end if leaning(end, pose, axis) < ASTRAY else turns[k] for k, end in zip(best, ends, strict=True)]
+    starts = [on_outline(others.mesh, view, turns[k]) for k in peaks[np.argsort(-evidence[peaks])[:PLACES]]]
+    ends = [descended_alike(others, view, start) for start in starts]
+    ends = [end if leaning(end, start, axis) < ASTRAY else start for start, end in zip(starts, ends, strict=True)]
     return ends[int(np.argmax([likelihood(others, view, p) for p in ends]))]
 
 
@@ -143,6 +145,11 @@ def correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> tuple[float
     """(of two pictures of contrasts (h, w), by weights (h, w); the patches that it rests on)."""
     size = np.sqrt((weight * a * a).sum() * (weight * b * b).sum())
     return float(np.clip((weight * a * b).sum() / max(size, 1e-6), -0.99, 0.99)), float(weight.sum() / (np.pi * PATCH**2))
+
+
+def on_outline(mesh: Mesh, view: View, pose: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) with which the mesh's outline lies on the view's mask where that is known; from one that is off by a few pixels."""
+    return follow_with_poses(mesh, [view.camera.with_pose(pose)], [view.mask], [view.known], OUTLINED, still=True)[1][0]
 
 
 def descended_alike(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
