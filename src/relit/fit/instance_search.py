@@ -4,6 +4,7 @@ place_revolved bodies of revolution, by their outlines and their decoration (fit
 pair_guesses   every instance's silhouette is inflated to a crude model, and every other one registered against it (fit/instance_guesses.py)
 borne_out      what matching has linked, as far as silhouettes and paint bear it out (fit/instance_links.py)
 grow           one instance after another joins those that stand already (fit/instance_growth.py); from several pairs, the best counts
+up_to_turns    what a set may be wrong by where the object nearly looks like itself when turned, told apart (fit/instance_turns.py)
 improved       where instances were not sure of their places: taken out and grown again, another way each time (fit/instance_regrowth.py)
 settled        rounds of a coarse model of all and a search for all poses by rendering it, descents, doubt (fit/instance_rounds.py)
 """
@@ -22,6 +23,7 @@ from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged
 from relit.fit.instance_revolution import mostly_sure, place_revolved
 from relit.fit.instance_rounds import settled
+from relit.fit.instance_turns import stands, told_apart
 from relit.fit.instances import View, best_seen, crops_of, first_pose, frame_scale
 from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
@@ -104,6 +106,17 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     return Found(poses, scores, believed(best, o))
 
 
+def up_to_turns(views, crops, placed: Placed, o: Search, *, seed: int, links=(), say=lambda text: None) -> Placed:
+    """The set, where the object nearly looks like itself when it is turned with those turned for whom silhouettes and paint ask for it.
+    Who was not sure of its place is asked again up to such turns."""
+    rings = crop_rings(crops, DETAILED)
+    turned = told_apart(views, crops, rings, placed.poses, o, seed=seed, say=say) if len(views) > 3 else None
+    if turned is None:
+        return placed
+    unsure = tuple(k for k in placed.unsure if not stands(views, crops, rings, turned, k, o, seed, links))
+    return Placed(turned.poses, turned.own, (), unsure, placed.parts)
+
+
 def grown_from_pairs(
     views: list[View],
     crops,
@@ -137,6 +150,7 @@ def grown_from_pairs(
                 f"grown from {' and '.join(str(views[k].label) for k in start)}: {len(views) - len(placed.unsure)} sure of their places, "
                 f"agreement of all with a model of all {placed.agreement:.3f}"
             )
+            placed = up_to_turns(views, crops, placed, o, seed=seed, links=links, say=say)
             if best is None or placed.agreement > best.agreement - (NO_GAIN if believed(placed, o) else 0):
                 best = placed
     return best

@@ -24,7 +24,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from relit.conventions import similarity
 from relit.fit.loop import NoStage
 from relit.fit.pixels import PixelBank, corrected, make_bank
-from relit.fit.register import Crop, crop_photo, volume_render
+from relit.fit.register import Crop, Render, crop_photo, volume_render
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
@@ -255,3 +255,12 @@ def moved_poses(bank: PixelBank, views: list[View], poses: np.ndarray) -> np.nda
 def albedo_render(model: VolumeModel):
     """Renders the model's colours without light on black, and its opacity: `fit.register.Render`."""
     return volume_render(replace(model, appearance=shade_albedo))
+
+
+def overlaps(render: Render, view: View, poses: np.ndarray) -> np.ndarray:
+    """(K,) intersection over union of the view's silhouette and the model's at poses (K, 4, 4), where it is known."""
+    h, w = view.mask.shape
+    square = replace(view.camera, width=max(h, w), height=max(h, w))
+    drawn = render([square.with_pose(p) for p in poses])[1][:, :h, :w] > 0.5
+    own, known = view.mask > 0.5, view.known > 0.5
+    return (drawn & own & known).sum((1, 2)) / np.maximum(((drawn | own) & known).sum((1, 2)), 1)

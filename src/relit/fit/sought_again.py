@@ -18,7 +18,7 @@ from relit.cameras.se3 import rotation_angle
 from relit.fit.instance_growth import ANOTHER
 from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED
-from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved_poses, pixel_bank
+from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved_poses, overlaps, pixel_bank
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from, volume_render
@@ -91,17 +91,8 @@ def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.n
 
 def where_outlines_agree(errors: np.ndarray, view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
     """The errors (K,) of places whose silhouettes agree with the view's, and about as well as the best of them, nan for others."""
-    left = 1 - overlaps(view, poses, model)
+    left = 1 - overlaps(volume_render(model), view, poses)
     return np.where(left <= min(1 - OUTLINE, AS_WELL * left.min()), errors, np.nan)
-
-
-def overlaps(view: View, poses: np.ndarray, model: VolumeModel) -> np.ndarray:
-    """(K,) intersection over union of the view's silhouette and the model's at poses (K, 4, 4), where it is known."""
-    h, w = view.mask.shape
-    square = replace(view.camera, width=max(h, w), height=max(h, w))
-    drawn = volume_render(model)([square.with_pose(p) for p in poses])[1][:, :h, :w] > 0.5
-    own, known = view.mask > 0.5, view.known > 0.5
-    return (drawn & own & known).sum((1, 2)) / np.maximum(((drawn | own) & known).sum((1, 2)), 1)
 
 
 def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:

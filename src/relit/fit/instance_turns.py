@@ -1,0 +1,191 @@
+"""Which of the turns by which an object nearly looks like itself each instance has.
+
+A teapot with the same flowers on either side: matching links its instances half a turn off as readily as right, and what grows on such
+links agrees with itself. Pictures of the body say the same either way, but spout and handle cannot both be on one side. So for the turns by
+which a model of all looks most like itself (fit/alike_turns.py) the set is sought whose silhouettes are of one body
+(fit/silhouette_turns.py); a model of all is fitted to it anew, as the turns may have blurred it, and it is sought again. Those whose
+silhouettes tell little, as spout and handle point at the camera, are then turned one at a time, and models fitted to all say
+which is better, by paint and by silhouettes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from relit.cameras.se3 import nearest_rotation, rotation_angle
+from relit.conventions import similarity
+from relit.fit.alike_turns import AlikeTurn, alike_turns, as_turn
+from relit.fit.instance_bodies import Body, body_of
+from relit.fit.instance_growth import ANOTHER, registered
+from relit.fit.instance_options import DETAILED, Search
+from relit.fit.instance_regrowth import NO_GAIN
+from relit.fit.instance_rounds import model_of_all
+from relit.fit.instances import View, eyes_at, overlaps
+from relit.fit.joint_alignment import tangents
+from relit.fit.register import Crop, Rings, directions_around, refine, views_from
+from relit.fit.silhouette_turns import Silhouettes
+from relit.geometry.hull import NoShape
+
+TRIED = 3  # turns by which the model looks most like itself
+ROUNDS = 4  # of silhouettes and models of all, until the silhouettes ask for no more
+NEAR = 20.0  # degrees within which instances that are turned are registered about where the turn puts them
+ASKED = 8  # instances that are turned one at a time: those for whom the silhouettes mind it least
+SWEEPS, SETTLED = 2, 2  # of these, and models of all on which poses settle before they are judged
+GAIN = 0.01  # of `Turned.value`, by which turns are worth it
+MOVED, TRIES = 0.05, 40  # unit lengths by which the turn's axis moves first, and how often it is looked at
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Poses (N, 4, 4), and scores (N,) of all against a model of all. value: their mean, and the mean overlap of the silhouettes with that
+    model, less what those of one body leave out (`Silhouettes.gap`). rotations: (S, 3, 3) that were asked, the first none."""
+
+    poses: np.ndarray
+    own: np.ndarray
+    value: float
+    rotations: np.ndarray = field(default_factory=lambda: np.eye(3)[None])
+
+
+def told_apart(
+    views: list[View], crops: list[Crop], rings: Rings, poses: np.ndarray, o: Search, *, seed: int, say=lambda text: None
+) -> Turned | None:
+    """The instances, some of them turned by one of the turns by which the object nearly looks like itself; None where none had to be.
+    rings: of the crops under DETAILED."""
+    try:
+        body = model_at(views, poses, o, seed)
+        first: Turned | None = None
+        for turn in alike_turns(body.gallery, TRIED):
+            sought = by_silhouettes(views, crops, rings, body, turn, o, seed)
+            if sought is None:
+                continue
+            first = first or judged(views, crops, rings, poses, o, seed)
+            best = one_at_a_time(views, crops, rings, sought, turn, o, seed)
+            if best.value > first.value + GAIN:
+                moved = int(sum(rotation_angle(a[:3, :3].T @ b[:3, :3]) > NEAR for a, b in zip(best.poses, poses, strict=True)))
+                say(
+                    f"{min(moved, len(views) - moved)} of {len(views)} were turned by a turn by which the object looks like itself (a "
+                    f"circle's part of {turn.order}): they agree better by {best.value - first.value:.3f}"
+                )
+                return replace(best, rotations=powers(about(turn, np.zeros(3)), turn.order)[:, :3, :3])
+    except NoShape:
+        pass
+    return None
+
+
+def stands(views, crops, rings: Rings, turned: Turned, k: int, o: Search, seed: int, links=()) -> bool:
+    """Whether an instance, asked against a model of the others, stands where it does, up to the turns that were told apart: every other
+    place scores less by `o.growth.sure`."""
+    rest = [j for j in range(len(views)) if j != k]
+    try:
+        body = model_at([views[j] for j in rest], turned.poses[rest], o, seed)
+    except NoShape:
+        return False
+    poses = turned.poses.copy()
+    poses[rest] = body.poses
+    places, heights = registered(views, crops, rings, DETAILED, body, poses, rest, [k], o.growth, links)
+    own = turned.rotations @ turned.poses[k][:3, :3]
+    here = np.array([min(rotation_angle(a.T @ p[0, :3, :3]) for a in own) < ANOTHER for p in places])
+    return bool(here.any() and heights[here].max() - max([*heights[~here, 0], 0.0]) >= o.growth.sure)
+
+
+def model_at(views, poses: np.ndarray, o: Search, seed: int) -> Body:
+    cameras = views_from(directions_around(o.growth.viewpoints, seed), eyes_at(poses))
+    return body_of(views, poses, cameras, DETAILED, o.growth, steps=o.growth.steps, seed=seed)
+
+
+def settled(crops, rings: Rings, body: Body, poses: np.ndarray) -> np.ndarray:
+    return refine(crops, poses, body.render, rings=rings, steps=(0, 4.0, 2.0), parts=DETAILED)[0]
+
+
+def by_silhouettes(views, crops, rings: Rings, body: Body, turn: AlikeTurn, o: Search, seed: int):
+    """Poses (N, 4, 4) after the turns that silhouettes ask for; None where they ask for none."""
+    moved = False
+    for trial in range(ROUNDS):
+        poses = settled(crops, rings, body, body.poses)
+        motions = motions_of(crops, rings, body, poses, turn)
+        shapes = Silhouettes(views, poses, motions)
+        _, turns = shapes.most_coherent(seed + trial)
+        if trial == 0 and turns.any():
+            motions = axis_moved(views, poses, motions, turns)
+            shapes = Silhouettes(views, poses, motions)
+            _, turns = shapes.most_coherent(seed + trial)
+        if not turns.any():
+            break
+        moved, poses = True, motions[turns] @ poses
+        body = model_at(views, poses, o, seed + trial + 1)
+    return poses if moved else None
+
+
+def powers(motion: np.ndarray, order: int) -> np.ndarray:
+    return np.array([np.linalg.matrix_power(motion, k) for k in range(order)])
+
+
+def about(turn: AlikeTurn, point: np.ndarray) -> np.ndarray:
+    """(4, 4) the turn about an axis through a point."""
+    return similarity(turn.rotation(), point - turn.rotation() @ point)
+
+
+def motions_of(crops, rings: Rings, body: Body, poses: np.ndarray, turn: AlikeTurn) -> np.ndarray:
+    """(S, 4, 4) the turn, about the axis about which the model looks most like itself, done none, one, ... times: all instances are
+    registered from where it puts them."""
+    there = settled(crops, rings, body, np.array([similarity(turn.rotation(), np.zeros(3)) @ p for p in poses]))
+    each = there @ np.linalg.inv(poses)
+    near = np.array([rotation_angle(turn.rotation().T @ m[:3, :3]) < NEAR for m in each])
+    if near.any():
+        mean = as_turn(nearest_rotation(each[near, :3, :3].sum(0)), turn.likeness)
+        turn = AlikeTurn(mean.axis, turn.order, turn.likeness)
+    point = np.linalg.pinv(np.eye(3) - turn.rotation()) @ np.median(each[near] if near.any() else each, axis=0)[:3, 3]
+    return powers(about(turn, point), turn.order)
+
+
+def axis_moved(views, poses: np.ndarray, motions: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """The motions about the axis, moved across itself, for which the turns that the silhouettes ask for leave the smallest gap."""
+    rotation = motions[1, :3, :3]
+    turn = AlikeTurn(as_turn(rotation, 0.0).axis, len(motions), 0.0)
+    point, across = np.linalg.pinv(np.eye(3) - rotation) @ motions[1, :3, 3], tangents(turn.axis[None])[0]
+
+    def moved(by: np.ndarray) -> np.ndarray:
+        return powers(about(turn, point + across @ by), turn.order)
+
+    found = minimize(
+        lambda by: Silhouettes(views, poses, moved(by)).gap(turns),
+        np.zeros(2),
+        method="Nelder-Mead",
+        options={"maxfev": TRIES, "initial_simplex": np.concatenate([np.zeros((1, 2)), MOVED * np.eye(2)])},
+    )
+    return moved(found.x)
+
+
+def judged(views, crops, rings: Rings, poses: np.ndarray, o: Search, seed: int) -> Turned:
+    """What a model of all says of poses after they have settled on models of all."""
+    for trial in range(SETTLED):
+        body = model_at(views, poses, o, seed + trial)
+        poses = settled(crops, rings, body, body.poses)
+    render, own = model_of_all(views, poses, o, seed=seed)
+    overlap = np.mean([overlaps(render, v, p[None])[0] for v, p in zip(views, poses, strict=True)])
+    gap = Silhouettes(views, poses, np.eye(4)[None]).gap(np.zeros(len(views), int))
+    return Turned(poses, own, float(own.mean() + overlap - gap))
+
+
+def one_at_a_time(views, crops, rings: Rings, poses: np.ndarray, turn: AlikeTurn, o: Search, seed: int) -> Turned:
+    """The best of those that differ in the turn of a single instance, again and again."""
+    best, none = judged(views, crops, rings, poses, o, seed), np.zeros(len(views), int)
+    for _ in range(SWEEPS):
+        before = best
+        body = model_at(views, best.poses, o, seed)
+        motions = motions_of(crops, rings, body, best.poses, turn)
+        shapes = Silhouettes(views, best.poses, motions)
+        ways = [(k, s) for k in range(len(views)) for s in range(1, len(motions))]
+        ways.sort(key=lambda way: shapes.gap(np.where(np.arange(len(views)) == way[0], way[1], none)))
+        for k, s in ways[:ASKED]:
+            other = best.poses.copy()
+            other[k] = motions[s] @ other[k]
+            tried = judged(views, crops, rings, other, o, seed)
+            if tried.value > best.value + NO_GAIN:
+                best = tried
+        if best is before:
+            break
+    return best
