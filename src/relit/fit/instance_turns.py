@@ -25,7 +25,7 @@ from relit.fit.instance_regrowth import NO_GAIN
 from relit.fit.instance_rounds import model_of_all
 from relit.fit.instances import View, eyes_at, overlaps
 from relit.fit.joint_alignment import tangents
-from relit.fit.register import Crop, Rings, directions_around, refine, views_from
+from relit.fit.register import Crop, Rings, chosen_rings, directions_around, refine, views_from
 from relit.fit.silhouette_turns import Silhouettes
 from relit.geometry.hull import NoShape
 
@@ -86,9 +86,10 @@ def stands(views, crops, rings: Rings, turned: Turned, k: int, o: Search, seed: 
     poses = turned.poses.copy()
     poses[rest] = body.poses
     places, heights = registered(views, crops, rings, DETAILED, body, poses, rest, [k], o.growth, links)
-    own = turned.rotations @ turned.poses[k][:3, :3]
-    here = np.array([min(rotation_angle(a.T @ p[0, :3, :3]) for a in own) < ANOTHER for p in places])
-    return bool(here.any() and heights[here].max() - max([*heights[~here, 0], 0.0]) >= o.growth.sure)
+    _, height = refine([crops[k]], poses[[k]], body.render, rings=chosen_rings(rings, [k]), steps=(0, 4.0, 2.0), parts=DETAILED)
+    own = turned.rotations @ poses[k][:3, :3]
+    away = np.array([min(rotation_angle(a.T @ p[0, :3, :3]) for a in own) >= ANOTHER for p in places])
+    return bool(max([float(height[0]), *heights[~away, 0]]) - max([*heights[away, 0], 0.0]) >= o.growth.sure)
 
 
 def model_at(views, poses: np.ndarray, o: Search, seed: int) -> Body:
