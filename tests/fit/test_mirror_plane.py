@@ -21,13 +21,13 @@ PARTS = (0.6, 2.0, 0.1)
 SIDE = 96
 
 
-def views_of_body(angles, colour, lopsided=0.0):
+def views_of_body(angles, colour, lopsided=0.0, parts=None):
     """(views, poses) of two ellipsoids, one at the other's head, coloured by position, seen from `angles` (degrees about +y) and a little
-    from above. lopsided: how far the head lies to one side (x)."""
+    from above. lopsided: how far the head lies to one side (x). parts: [(middle, half axes)] of other ellipsoids."""
     u, v = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
     camera = Camera(SIDE, SIDE, 230.0, 230.0, SIDE / 2, SIDE / 2, np.eye(4))
     d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
-    parts = [(np.zeros(3), np.array([0.3, 0.25, 0.55])), (np.array([lopsided, 0.3, 0.35]), np.array([0.2, 0.3, 0.15]))]
+    parts = parts or [(np.zeros(3), np.array([0.3, 0.25, 0.55])), (np.array([lopsided, 0.3, 0.35]), np.array([0.2, 0.3, 0.15]))]
     views, poses = [], []
     for k, a in enumerate(angles):
         turn = exp_so3(np.array([0.0, np.radians(a), 0.0])) @ exp_so3(np.array([-0.4, 0.0, 0.0]))

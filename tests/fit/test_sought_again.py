@@ -13,7 +13,7 @@ from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
 from relit.fit import sought_again as module
 from relit.fit.duplicates_shape import carried
-from relit.fit.instances import View, pixel_bank
+from relit.fit.instances import View, overlaps, pixel_bank
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import volume_render
 from relit.fit.sought_again import sought_again
@@ -70,13 +70,13 @@ def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turne
     shifted = poses[[0, 0, 0]]
     shifted[1, :3, 3] += [0.4, 0.0, 0.0]
     shifted[2, :3, 3] += [0.01, 0.0, 0.0]
-    shares = module.overlaps(guide, shifted, model)
+    shares = overlaps(volume_render(model), guide, shifted)
     assert shares[0] > 0.97 and shares[1] < 0.8 < shares[2]
     axis = Axis(np.array([0.1, 0.0, -0.2]), np.array([0.6, 0.8, 0.0]))
     tried = np.stack([turned_by(poses[0], axis, 1.01), shifted[1]])
     monkeypatch.setattr(module, "candidates", lambda *_: tried)
     monkeypatch.setattr(module, "descended", lambda *_: (tried, np.array([50.0, 20.0])))  # nothing agrees, least where the outline does not
-    monkeypatch.setattr(module, "overlaps", lambda _, some, model: np.where(np.arange(len(some)) % 2 > 0, 0.5, 1))
+    monkeypatch.setattr(module, "overlaps", lambda render, _, some: np.where(np.arange(len(some)) % 2 > 0, 0.5, 1))
 
     asked = []
 
@@ -87,7 +87,7 @@ def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turne
     found, sure = sought_again(guide, guide, poses[0], model, 1.0, None, turned=turned)
     assert np.allclose(found, poses[0]) and not sure and asked == [guide]
     assert sought_again(guide, guide, poses[0], model, 1.0, None) == (None, False), "not a body of revolution"
-    monkeypatch.setattr(module, "overlaps", lambda view, some, model: np.full(len(some), 0.5))
+    monkeypatch.setattr(module, "overlaps", lambda render, view, some: np.full(len(some), 0.5))
     assert sought_again(guide, guide, poses[0], model, 1.0, None, turned=turned) == (None, False)
 
 
@@ -136,6 +136,6 @@ def test_poses_are_carried_along_with_those_that_passes_have_moved():
 )
 def test_places_count_whose_silhouettes_agree_about_as_well_as_the_best(monkeypatch, shared, there):
     """What is in the wrong place by a fifth of its radius can still overlap by .95, and agree in colour by chance."""
-    monkeypatch.setattr(module, "overlaps", lambda view, poses, model: np.array(shared))
+    monkeypatch.setattr(module, "overlaps", lambda render, view, poses: np.array(shared))
     found = module.where_outlines_agree(np.array([3.0, 2.0, 1.0]), None, None, None)
     assert np.array_equal(np.isfinite(found), np.array(there, bool))

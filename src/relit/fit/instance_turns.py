@@ -35,7 +35,8 @@ NEAR = 20.0  # degrees within which instances that are turned are registered abo
 ASKED = 8  # instances that are turned one at a time: those for whom the silhouettes mind it least
 SWEEPS, SETTLED = 2, 2  # of these, and models of all on which poses settle before they are judged
 GAIN = 0.01  # of `Turned.value`, by which turns are worth it
-MOVED, TRIES = 0.05, 40  # unit lengths by which the turn's axis moves first, and how often it is looked at
+CLEARLY = 0.005  # of the gap, that turns must close to be looked into: of a body of revolution any turn is as good
+MOVED, TRIES = 0.05, 30  # unit lengths by which the turn's axis moves first, and how often it is looked at
 
 
 @dataclass(frozen=True)
@@ -108,12 +109,12 @@ def by_silhouettes(views, crops, rings: Rings, body: Body, turn: AlikeTurn, o: S
         poses = settled(crops, rings, body, body.poses)
         motions = motions_of(crops, rings, body, poses, turn)
         shapes = Silhouettes(views, poses, motions)
-        _, turns = shapes.most_coherent(seed + trial)
+        gap, turns = shapes.most_coherent(seed + trial)
         if trial == 0 and turns.any():
             motions = axis_moved(views, poses, motions, turns)
             shapes = Silhouettes(views, poses, motions)
-            _, turns = shapes.most_coherent(seed + trial)
-        if not turns.any():
+            gap, turns = shapes.most_coherent(seed + trial)
+        if not turns.any() or (trial == 0 and gap > shapes.gap(0 * turns) - CLEARLY):
             break
         moved, poses = True, motions[turns] @ poses
         body = model_at(views, poses, o, seed + trial + 1)

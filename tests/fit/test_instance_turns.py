@@ -1,0 +1,107 @@
+"""A pot with the same paint on either side: half a turn of it is told by its spout and its handle alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_mirror_plane import views_of_body
+
+from relit.cameras.se3 import exp_so3, rotation_angle
+from relit.conventions import similarity
+from relit.fit import instance_turns
+from relit.fit.alike_turns import AlikeTurn, alike_turns, apart
+from relit.fit.instance_options import DETAILED, Search
+from relit.fit.instance_turns import Turned, axis_moved, model_at, powers, stands, told_apart
+from relit.fit.instances import crops_of
+from relit.fit.register import crop_rings
+from relit.fit.silhouette_turns import Silhouettes
+
+BODY = (np.zeros(3), np.array([0.4, 0.3, 0.4]))
+SPOUT = (np.array([0.5, 0.1, 0.0]), np.array([0.22, 0.06, 0.06]))
+HANDLE = (np.array([-0.42, 0.0, 0.0]), np.array([0.14, 0.28, 0.05]))
+HALF = similarity(exp_so3(np.array([0, np.pi, 0])), np.zeros(3))
+WRONG = np.array([0, 1, 1, 0, 0, 1, 0, 1])
+
+
+def twice(p):
+    """A colour that is the same after half a turn about y."""
+    a = 2 * np.arctan2(p[:, 0], p[:, 2])
+    return 0.5 + 0.25 * np.stack([np.sin(a + 9 * p[:, 1]), np.cos(2 * a - 7 * p[:, 1]), np.sin(3 * a + 0.5)], -1)
+
+
+def pot(parts=(BODY, SPOUT, HANDLE), colour=twice):
+    return views_of_body(np.arange(8) * 360 / 8 + [25, 11, 32, 20, 28, 14, 23, 30], colour, parts=list(parts))
+
+
+@pytest.fixture(scope="module")
+def pots():
+    return pot()
+
+
+def turned(poses, which):
+    return np.where(np.asarray(which)[:, None, None] > 0, HALF @ poses, poses)
+
+
+def errors(poses, true):
+    """Degrees, up to one turn of all."""
+    e = np.array([p[:3, :3] @ t[:3, :3].T for p, t in zip(poses, true, strict=True)])
+    return min((np.array([rotation_angle(m.T @ d) for d in e]) for m in e), key=np.median)
+
+
+def test_a_model_of_it_looks_most_like_itself_after_half_a_turn(pots):
+    views, poses = pots
+    best, *others = alike_turns(model_at(views, poses, Search(), 0).gallery, 3)
+    assert best.order == 2 and abs(best.axis[1]) > 0.99 and all(best.likeness > t.likeness + 0.05 for t in others)
+    assert np.allclose(best.rotation(2), np.eye(3)) and np.allclose(AlikeTurn(best.axis, 4, 0).rotation(2), best.rotation())
+
+
+def test_of_turns_that_are_nearly_the_same_or_undo_one_another_the_best_is_kept():
+    tried = [(k / 10, exp_so3(np.radians(a) * np.array([0, 1.0, 0]))) for k, a in enumerate((75, -115, 180, 110, 120, 60))]
+    assert [value for value, _ in apart(tried, 5)] == [0.5, 0.4, 0.2]
+    assert [value for value, _ in apart(tried, 2)] == [0.5, 0.4]
+
+
+def test_silhouettes_of_one_body_leave_the_smallest_gap(pots):
+    views, poses = pots
+    found = Silhouettes(views, turned(poses, WRONG), powers(HALF, 2))
+    none, right = np.zeros(8, int), WRONG ^ WRONG[0]
+    assert found.gap(right) < 0.7 * found.gap(none) < 0.7 * found.gap(1 - (np.arange(8) == 0)) + 0.2
+    gap, turns = found.most_coherent(0)
+    assert np.array_equal(turns, right) and gap == found.gap(right)
+    assert found.descended(right)[0] == gap
+    blind = Silhouettes([replace(v, known=np.zeros_like(v.known)) for v in views], poses, powers(HALF, 2))
+    assert blind.gap(none) == blind.gap(right) == 0
+
+
+def test_the_axis_of_the_turn_is_moved_to_where_silhouettes_fit(pots):
+    views, poses = pots
+    off = similarity(HALF[:3, :3], [0.08, 0.0, -0.06])  # an axis .05 from the object's
+    moved = axis_moved(views, turned(poses, WRONG), powers(off, 2), WRONG)
+    assert np.abs(moved[1, :3, 3]).max() < 0.03 and np.allclose(moved[1, :3, :3], off[:3, :3])
+
+
+def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monkeypatch):
+    monkeypatch.setattr(instance_turns, "ASKED", 1)
+    monkeypatch.setattr(instance_turns, "SETTLED", 1)
+    views, poses = pots
+    crops, said = crops_of(views), []
+    rings = crop_rings(crops, DETAILED)
+    off = turned(poses, WRONG)
+    assert (errors(off, poses) > 170).sum() == 4
+    found = told_apart(views, crops, rings, off, Search(), seed=0, say=said.append)
+    assert errors(found.poses, poses).max() < 8 and "4 of 8 were turned" in said[0] and len(found.rotations) == 2
+    assert told_apart(views, crops, rings, poses, Search(), seed=0) is None
+    assert all(stands(views, crops, rings, found, k, Search(), 0) for k in (0, 3))
+    astray = found.poses.copy()
+    astray[3] = similarity(exp_so3(np.array([0.9, 0, 0.4])), np.zeros(3)) @ astray[3]
+    assert not stands(views, crops, rings, Turned(astray, found.own, found.value, found.rotations), 3, Search(), 0)
+
+
+def test_an_object_that_looks_like_itself_all_the_way_is_left_alone(monkeypatch):
+    """Neither spout nor handle: either way is right. No models are fitted to find that out."""
+    views, poses = pot([BODY])
+    crops = crops_of(views)
+    monkeypatch.setattr(instance_turns, "judged", lambda *_: pytest.fail("asked"))
+    assert told_apart(views, crops, crop_rings(crops, DETAILED), turned(poses, WRONG), Search(), seed=0) is None
