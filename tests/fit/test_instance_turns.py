@@ -10,10 +10,11 @@ from test_mirror_plane import views_of_body
 
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
-from relit.fit import instance_turns
+from relit.fit import instance_search, instance_turns
 from relit.fit.alike_turns import AlikeTurn, alike_turns, apart
 from relit.fit.instance_options import DETAILED, Search
-from relit.fit.instance_turns import Turned, axis_moved, model_at, powers, stands, told_apart
+from relit.fit.instance_regrowth import Placed
+from relit.fit.instance_turns import Turned, axis_moved, model_at, powers, stands, coherent_turns
 from relit.fit.instances import crops_of
 from relit.fit.register import crop_rings
 from relit.fit.silhouette_turns import Silhouettes
@@ -90,9 +91,9 @@ def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monk
     rings = crop_rings(crops, DETAILED)
     off = turned(poses, WRONG)
     assert (errors(off, poses) > 170).sum() == 4
-    found = told_apart(views, crops, rings, off, Search(), seed=0, say=said.append)
+    found = coherent_turns(views, crops, rings, off, Search(), seed=0, say=said.append)
     assert errors(found.poses, poses).max() < 8 and "4 of 8 were turned" in said[0] and len(found.rotations) == 2
-    assert told_apart(views, crops, rings, poses, Search(), seed=0) is None
+    assert coherent_turns(views, crops, rings, poses, Search(), seed=0) is None
     assert all(stands(views, crops, rings, found, k, Search(), 0) for k in (0, 3))
     astray = found.poses.copy()
     astray[3] = similarity(exp_so3(np.array([0.9, 0, 0.4])), np.zeros(3)) @ astray[3]
@@ -104,4 +105,16 @@ def test_an_object_that_looks_like_itself_all_the_way_is_left_alone(monkeypatch)
     views, poses = pot([BODY])
     crops = crops_of(views)
     monkeypatch.setattr(instance_turns, "judged", lambda *_: pytest.fail("asked"))
-    assert told_apart(views, crops, crop_rings(crops, DETAILED), turned(poses, WRONG), Search(), seed=0) is None
+    assert coherent_turns(views, crops, crop_rings(crops, DETAILED), turned(poses, WRONG), Search(), seed=0) is None
+
+
+def test_who_stands_up_to_such_turns_is_no_longer_unsure(pots, monkeypatch):
+    views, poses = pots
+    found = Turned(turned(poses, WRONG), np.arange(8) / 8, 1.0)
+    placed = Placed(poses, np.ones(8), (0, 1), (2, 4, 6), DETAILED)
+    monkeypatch.setattr(instance_search, "coherent_turns", lambda *_, **__: found)
+    monkeypatch.setattr(instance_search, "stands", lambda views, crops, rings, turned, k, *_: turned is found and k != 4)
+    best = instance_search.up_to_turns(views, crops_of(views), placed, Search(), seed=0)
+    assert np.array_equal(best.poses, found.poses) and best.unsure == (4,) and best.agreement == found.own.mean()
+    monkeypatch.setattr(instance_search, "coherent_turns", lambda *_, **__: None)
+    assert instance_search.up_to_turns(views, crops_of(views), placed, Search(), seed=0) is placed

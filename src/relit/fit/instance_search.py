@@ -4,9 +4,11 @@ place_revolved bodies of revolution, by their outlines and their decoration (fit
 pair_guesses   every instance's silhouette is inflated to a crude model, and every other one registered against it (fit/instance_guesses.py)
 borne_out      what matching has linked, as far as silhouettes and paint bear it out (fit/instance_links.py)
 grow           one instance after another joins those that stand already (fit/instance_growth.py); from several pairs, the best counts
-up_to_turns    what a set may be wrong by where the object nearly looks like itself when turned, told apart (fit/instance_turns.py)
-improved       where instances were not sure of their places: taken out and grown again, another way each time (fit/instance_regrowth.py)
+up_to_turns    where instances were not sure of their places: those turned that the silhouettes ask for, if the object nearly looks like
+               itself when it is turned (fit/instance_turns.py)
+improved       where they are not yet sure: taken out and grown again, another way each time (fit/instance_regrowth.py)
 settled        rounds of a coarse model of all and a search for all poses by rendering it, descents, doubt (fit/instance_rounds.py)
+coherent_turns as up_to_turns, of the poses that have come out
 """
 
 from __future__ import annotations
@@ -22,8 +24,8 @@ from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged
 from relit.fit.instance_revolution import mostly_sure, place_revolved
-from relit.fit.instance_rounds import settled
-from relit.fit.instance_turns import stands, told_apart
+from relit.fit.instance_rounds import descend, settled
+from relit.fit.instance_turns import stands, coherent_turns
 from relit.fit.instances import View, best_seen, crops_of, first_pose, frame_scale
 from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
@@ -98,11 +100,17 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
     if best is None:
         raise NoShape("no set of poses agrees with the silhouettes")
     if not believed(best, o) and len(views) > 3:
+        best = up_to_turns(views, crops, best, o, seed=seed + 50, links=links, say=say)
+    if not believed(best, o) and len(views) > 3:
         best = improved(views, crops, crop_rings(crops, DETAILED), best, o, seed=seed + 60, links=links, say=say)
     if not believed(best, o):
         doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
         say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
-    poses, scores = settled(views, crops, crop_rings(crops, best.parts), best.poses, best.own, o, seed=seed, parts=best.parts, say=say)
+    rings = crop_rings(crops, best.parts)
+    poses, scores = settled(views, crops, rings, best.poses, best.own, o, seed=seed, parts=best.parts, say=say)
+    turned = coherent_turns(views, crops, crop_rings(crops, DETAILED), poses, o, seed=seed + 70, say=say) if len(views) > 3 else None
+    if turned is not None:
+        poses, scores = descend(views, crops, rings, turned.poses, turned.own, o, seed=seed + 80, parts=best.parts, say=say)
     return Found(poses, scores, believed(best, o))
 
 
@@ -110,7 +118,7 @@ def up_to_turns(views, crops, placed: Placed, o: Search, *, seed: int, links=(),
     """The set, where the object nearly looks like itself when it is turned with those turned for whom silhouettes and paint ask for it.
     Who was not sure of its place is asked again up to such turns."""
     rings = crop_rings(crops, DETAILED)
-    turned = told_apart(views, crops, rings, placed.poses, o, seed=seed, say=say) if len(views) > 3 else None
+    turned = coherent_turns(views, crops, rings, placed.poses, o, seed=seed, say=say)
     if turned is None:
         return placed
     unsure = tuple(k for k in placed.unsure if not stands(views, crops, rings, turned, k, o, seed, links))
@@ -150,7 +158,6 @@ def grown_from_pairs(
                 f"grown from {' and '.join(str(views[k].label) for k in start)}: {len(views) - len(placed.unsure)} sure of their places, "
                 f"agreement of all with a model of all {placed.agreement:.3f}"
             )
-            placed = up_to_turns(views, crops, placed, o, seed=seed, links=links, say=say)
             if best is None or placed.agreement > best.agreement - (NO_GAIN if believed(placed, o) else 0):
                 best = placed
     return best

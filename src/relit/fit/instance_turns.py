@@ -50,7 +50,7 @@ class Turned:
     rotations: np.ndarray = field(default_factory=lambda: np.eye(3)[None])
 
 
-def told_apart(
+def coherent_turns(
     views: list[View], crops: list[Crop], rings: Rings, poses: np.ndarray, o: Search, *, seed: int, say=lambda text: None
 ) -> Turned | None:
     """The instances, some of them turned by one of the turns by which the object nearly looks like itself; None where none had to be.
