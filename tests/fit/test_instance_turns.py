@@ -14,7 +14,7 @@ from relit.fit import instance_search, instance_turns
 from relit.fit.alike_turns import AlikeTurn, alike_turns, apart
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import Placed
-from relit.fit.instance_turns import Turned, axis_moved, model_at, powers, stands, coherent_turns
+from relit.fit.instance_turns import Turned, axis_moved, coherent_turns, model_at, powers, stands
 from relit.fit.instances import crops_of
 from relit.fit.register import crop_rings
 from relit.fit.silhouette_turns import Silhouettes

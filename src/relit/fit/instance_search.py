@@ -25,7 +25,7 @@ from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged
 from relit.fit.instance_revolution import mostly_sure, place_revolved
 from relit.fit.instance_rounds import descend, settled
-from relit.fit.instance_turns import stands, coherent_turns
+from relit.fit.instance_turns import coherent_turns, stands
 from relit.fit.instances import View, best_seen, crops_of, first_pose, frame_scale
 from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
