@@ -152,12 +152,11 @@ def axis_moved(views, poses: np.ndarray, motions: np.ndarray, turns: np.ndarray)
     def moved(by: np.ndarray) -> np.ndarray:
         return powers(about(turn, point + across @ by), turn.order)
 
-    found = minimize(
-        lambda by: Silhouettes(views, poses, moved(by)).gap(turns),
-        np.zeros(2),
-        method="Nelder-Mead",
-        options={"maxfev": TRIES, "initial_simplex": np.concatenate([np.zeros((1, 2)), MOVED * np.eye(2)])},
-    )
+    def gap(by: np.ndarray) -> float:
+        return Silhouettes(views, moved(by)[turns] @ poses, np.eye(4)[None]).gap(0 * turns)
+
+    simplex = np.concatenate([np.zeros((1, 2)), MOVED * np.eye(2)])
+    found = minimize(gap, np.zeros(2), method="Nelder-Mead", options={"maxfev": TRIES, "initial_simplex": simplex})
     return moved(found.x)
 
 

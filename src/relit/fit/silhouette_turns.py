@@ -16,7 +16,8 @@ from relit.geometry.sdf import node_positions
 NODES = 64
 STRICT = 0.02  # share of the views that may show background where the body is
 CLOSED = np.ones((5, 5), np.uint8)  # pixels between nodes
-STARTS = 12  # sets of turns that are descended from, all but the first drawn
+STARTS, FEWEST = 12, 2  # sets of turns that are descended from, all but the first drawn; fewer of many views, down to these
+ASKED = 120  # turns of single views, of all sets together in one sweep
 SWEEPS = 8  # of each descent, at most
 
 
@@ -77,5 +78,6 @@ class Silhouettes:
     def most_coherent(self, seed: int) -> tuple[float, np.ndarray]:
         """(gap, turns (N,)) with the smallest gap that descents from the views as they are and from drawn turns come to."""
         rng, n = np.random.default_rng(seed), len(self.views)
-        starts = [np.zeros(n, int)] + [np.concatenate([[0], rng.integers(0, self.count, n - 1)]) for _ in range(STARTS - 1)]
+        count = int(np.clip(ASKED // (n * max(1, self.count - 1)), FEWEST, STARTS))
+        starts = [np.zeros(n, int)] + [np.concatenate([[0], rng.integers(0, self.count, n - 1)]) for _ in range(count - 1)]
         return min((self.descended(s) for s in starts), key=lambda one: one[0])
