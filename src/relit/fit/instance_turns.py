@@ -70,7 +70,7 @@ def coherent_turns(
                     f"{min(moved, len(views) - moved)} of {len(views)} were turned by a turn by which the object looks like itself (a "
                     f"circle's part of {turn.order}): they agree better by {best.value - first.value:.3f}"
                 )
-                return replace(best, rotations=powers(about(turn, np.zeros(3)), turn.order)[:, :3, :3])
+                return replace(best, rotations=motions_about(turn, np.zeros(3))[:, :3, :3])
     except NoShape:
         pass
     return None
@@ -107,11 +107,12 @@ def by_silhouettes(views, crops, rings: Rings, body: Body, turn: AlikeTurn, o: S
     moved = False
     for trial in range(ROUNDS):
         poses = settled(crops, rings, body, body.poses)
-        motions = motions_of(crops, rings, body, poses, turn)
+        placed, point = placed_axis(crops, rings, body, poses, turn)
+        motions = motions_about(placed, point)
         shapes = Silhouettes(views, poses, motions)
         gap, turns = shapes.most_coherent(seed + trial)
         if trial == 0 and turns.any():
-            motions = axis_moved(views, poses, motions, turns)
+            motions = motions_about(placed, axis_moved(views, poses, placed, point, turns))
             shapes = Silhouettes(views, poses, motions)
             gap, turns = shapes.most_coherent(seed + trial)
         if not turns.any() or (trial == 0 and gap > shapes.gap(0 * turns) - CLEARLY):
@@ -121,43 +122,35 @@ def by_silhouettes(views, crops, rings: Rings, body: Body, turn: AlikeTurn, o: S
     return poses if moved else None
 
 
-def powers(motion: np.ndarray, order: int) -> np.ndarray:
-    return np.array([np.linalg.matrix_power(motion, k) for k in range(order)])
+def motions_about(turn: AlikeTurn, point: np.ndarray) -> np.ndarray:
+    """(S, 4, 4) the turn about an axis through a point, done none, one, ... times."""
+    rotations = [turn.rotation(k) for k in range(turn.order)]
+    return np.array([similarity(r, point - r @ point) for r in rotations])
 
 
-def about(turn: AlikeTurn, point: np.ndarray) -> np.ndarray:
-    """(4, 4) the turn about an axis through a point."""
-    return similarity(turn.rotation(), point - turn.rotation() @ point)
-
-
-def motions_of(crops, rings: Rings, body: Body, poses: np.ndarray, turn: AlikeTurn) -> np.ndarray:
-    """(S, 4, 4) the turn, about the axis about which the model looks most like itself, done none, one, ... times: all instances are
-    registered from where it puts them."""
+def placed_axis(crops, rings: Rings, body: Body, poses: np.ndarray, turn: AlikeTurn) -> tuple[AlikeTurn, np.ndarray]:
+    """The turn, and a point of its axis, by which the model looks most like itself: all instances are registered from where it puts
+    them."""
     there = settled(crops, rings, body, np.array([similarity(turn.rotation(), np.zeros(3)) @ p for p in poses]))
     each = there @ np.linalg.inv(poses)
     near = np.array([rotation_angle(turn.rotation().T @ m[:3, :3]) < NEAR for m in each])
     if near.any():
-        mean = as_turn(nearest_rotation(each[near, :3, :3].sum(0)), turn.likeness)
-        turn = AlikeTurn(mean.axis, turn.order, turn.likeness)
-    point = np.linalg.pinv(np.eye(3) - turn.rotation()) @ np.median(each[near] if near.any() else each, axis=0)[:3, 3]
-    return powers(about(turn, point), turn.order)
+        turn = replace(turn, axis=as_turn(nearest_rotation(each[near, :3, :3].sum(0)), turn.likeness).axis)
+    moves = np.median(each[near] if near.any() else each, axis=0)[:3, 3]
+    return turn, np.linalg.pinv(np.eye(3) - turn.rotation()) @ moves
 
 
-def axis_moved(views, poses: np.ndarray, motions: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """The motions about the axis, moved across itself, for which the turns that the silhouettes ask for leave the smallest gap."""
-    rotation = motions[1, :3, :3]
-    turn = AlikeTurn(as_turn(rotation, 0.0).axis, len(motions), 0.0)
-    point, across = np.linalg.pinv(np.eye(3) - rotation) @ motions[1, :3, 3], tangents(turn.axis[None])[0]
-
-    def moved(by: np.ndarray) -> np.ndarray:
-        return powers(about(turn, point + across @ by), turn.order)
+def axis_moved(views, poses: np.ndarray, turn: AlikeTurn, point: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """A point of the axis, moved across itself, for which the turns that the silhouettes ask for leave the smallest gap."""
+    across = tangents(turn.axis[None])[0]
 
     def gap(by: np.ndarray) -> float:
-        return Silhouettes(views, moved(by)[turns] @ poses, np.eye(4)[None]).gap(0 * turns)
+        there = motions_about(turn, point + across @ by)[turns] @ poses
+        return Silhouettes(views, there, np.eye(4)[None]).gap(0 * turns)
 
     simplex = np.concatenate([np.zeros((1, 2)), MOVED * np.eye(2)])
     found = minimize(gap, np.zeros(2), method="Nelder-Mead", options={"maxfev": TRIES, "initial_simplex": simplex})
-    return moved(found.x)
+    return point + across @ found.x
 
 
 def judged(views, crops, rings: Rings, poses: np.ndarray, o: Search, seed: int) -> Turned:
@@ -177,7 +170,7 @@ def one_at_a_time(views, crops, rings: Rings, poses: np.ndarray, turn: AlikeTurn
     for _ in range(SWEEPS):
         before = best
         body = model_at(views, best.poses, o, seed)
-        motions = motions_of(crops, rings, body, best.poses, turn)
+        motions = motions_about(*placed_axis(crops, rings, body, best.poses, turn))
         shapes = Silhouettes(views, best.poses, motions)
         ways = [(k, s) for k in range(len(views)) for s in range(1, len(motions))]
         ways.sort(key=lambda way: shapes.gap(np.where(np.arange(len(views)) == way[0], way[1], none)))

@@ -58,11 +58,11 @@ class Silhouettes:
 
     def descended(self, turns: np.ndarray) -> tuple[float, np.ndarray]:
         """(gap, turns) where no other turn of a single view leaves less; the first view stays."""
-        turns, best = turns.copy(), self.gap(turns)
+        turns, (told, out) = turns.copy(), self.sums(turns)
+        best = float(np.mean(self.gaps(turns, told, out)))
         for _ in range(SWEEPS):
             before = best
             for k in range(1, len(turns)):
-                told, out = self.sums(turns)
                 for s in set(range(self.count)) - {int(turns[k])}:
                     other = turns.copy()
                     other[k] = s
