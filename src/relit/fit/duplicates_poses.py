@@ -15,13 +15,11 @@ from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instance_growth import seen_from
-from relit.fit.instance_options import DETAILED, Search
-from relit.fit.instance_rounds import ambiguous, descend
+from relit.fit.instance_options import Search
+from relit.fit.instance_rounds import ambiguous
 from relit.fit.instance_search import LEFT_OUT
 from relit.fit.instance_trials import place_few
-from relit.fit.instance_turns import coherent_turns
-from relit.fit.instances import COARSE, View, carved, crops_of, views_of
-from relit.fit.register import crop_rings
+from relit.fit.instances import COARSE, View, carved, views_of
 from relit.geometry.hull import NoShape
 from relit.run import run_arrays
 from relit.scene import Camera, Pixels
@@ -69,14 +67,13 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
             raise UserError("hardly any instance could be placed", "see the scores in the log", "check the label image", code=EXIT_FAILED)
         for k in np.flatnonzero(~registered & (scores > LEFT_OUT)):
             run.say(f"note: the object with {named(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only")
-        say_far_apart(poses[registered], run)
-        poses = adjusted_poses(matched, poses, registered, options, run)
         unsure = np.zeros(len(views))
         if registered.sum() > 2 and "refinement" not in options.without:
-            turned = told_apart(views, poses, registered, search, seed, run)
-            poses = poses if turned is None else adjusted_poses(matched, turned, registered, options, run)
             unsure[registered] = ambiguous([v for v, ok in zip(views, registered, strict=True) if ok], poses[registered], search, seed=seed)
             say_ambiguous(views, unsure, int(registered.sum()), run)
+        say_far_apart(poses[registered], run)
+        if matched and not {"guided", "refinement"} & set(options.without):
+            poses = adjusted_poses(matched, poses, registered, run)
         poses = centred(views, poses, registered)
         keys = np.array([v.key for v in views])
         axes = scores == LEFT_OUT
@@ -170,10 +167,8 @@ def match_instances(shots: list[Shot], run, options: DuplicatesOptions, seed: in
     return Matched(features, links, tuple(out), cameras, error)
 
 
-def adjusted_poses(matched: Matched | None, poses: np.ndarray, registered: np.ndarray, options: DuplicatesOptions, run) -> np.ndarray:
+def adjusted_poses(matched: Matched, poses: np.ndarray, registered: np.ndarray, run) -> np.ndarray:
     """The poses after matches were sought again, guided by them, and adjusted over these (SfD Sec. 3.1, after the search)."""
-    if matched is None or {"guided", "refinement"} & set(options.without):
-        return poses
     from relit.cameras.guided import guided
     from relit.cameras.sfm import quiet
     from relit.device import load_pycolmap
@@ -189,23 +184,6 @@ def adjusted_poses(matched: Matched | None, poses: np.ndarray, registered: np.nd
     if count:
         turns = [rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(out[chosen], poses[chosen], strict=True)]
         run.say(f"matches guided by the poses link {count} pairs; bundle adjustment turns the instances by {np.median(turns):.1f} degrees")
-    return out
-
-
-def told_apart(views: list[View], poses: np.ndarray, registered: np.ndarray, o: Search, seed: int, run) -> np.ndarray | None:
-    """The poses with those instances turned that the search has put wrong by a turn by which the object nearly looks like itself; None
-    where there are none (fit/instance_turns.py). Silhouettes tell such turns the better the more exact the poses are."""
-    chosen = np.flatnonzero(registered)
-    some = [views[k] for k in chosen]
-    if len(some) < 4:
-        return None
-    crops = crops_of(some)
-    rings = crop_rings(crops, DETAILED)
-    turned = coherent_turns(some, crops, rings, poses[chosen], o, seed=seed, say=run.say)
-    if turned is None:
-        return None
-    out = poses.copy()
-    out[chosen] = descend(some, crops, rings, turned.poses, turned.own, o, seed=seed, say=run.say)[0]
     return out
 
 

@@ -8,6 +8,7 @@ up_to_turns    where instances were not sure of their places: those turned that 
                itself when it is turned (fit/instance_turns.py)
 improved       where they are not yet sure: taken out and grown again, another way each time (fit/instance_regrowth.py)
 settled        rounds of a coarse model of all and a search for all poses by rendering it, descents, doubt (fit/instance_rounds.py)
+coherent_turns as up_to_turns, of the poses that have come out
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged
 from relit.fit.instance_revolution import mostly_sure, place_revolved
-from relit.fit.instance_rounds import settled
+from relit.fit.instance_rounds import descend, settled
 from relit.fit.instance_turns import coherent_turns, stands
 from relit.fit.instances import View, best_seen, crops_of, first_pose, frame_scale
 from relit.fit.mirror_plane import flipped_views
@@ -107,6 +108,9 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
     rings = crop_rings(crops, best.parts)
     poses, scores = settled(views, crops, rings, best.poses, best.own, o, seed=seed, parts=best.parts, say=say)
+    turned = coherent_turns(views, crops, crop_rings(crops, DETAILED), poses, o, seed=seed + 70, say=say) if len(views) > 3 else None
+    if turned is not None:
+        poses, scores = descend(views, crops, rings, turned.poses, turned.own, o, seed=seed + 80, parts=best.parts, say=say)
     return Found(poses, scores, believed(best, o))
 
 
