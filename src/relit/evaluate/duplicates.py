@@ -70,7 +70,7 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
 }
 
 
-def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
+def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
     """Every figure that the truth allows, as `evaluate.protocols.evaluate`. Raises UserError where the truth is unfinished."""
     from relit.asset.asset import load_asset, read_json
     from relit.images import read_data
@@ -96,7 +96,7 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     loaded = trimesh.load(folder / "truth" / "mesh.ply", process=False)
     true_points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).points
     scale, own_middle, frame = scene_alignment(poses, true_poses, photo, true_points, asset.mesh.vertices)
-    radius = truth["radius"]
+    radius, depth = truth["radius"], truth["settings"]["max_depth"]
     values["translation_median"] = centre_error(poses, true_poses, photo, scale, own_middle, true_points) / radius
     values["surface_median"] = surface_error(poses, true_poses, photo, scale, frame, true_points[:: SAMPLES // 2000]) / radius
     own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
@@ -129,14 +129,14 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
             per_view[name][f"{key}_mse"] = float(np.square(p[key] - t)[where].mean())
         per_view[name]["albedo_psnr"] = m.psnr(m.encode(p["albedo"] * factor), m.encode(reference[name][..., :3]), where)
         picture = read_data(folder / "truth" / "test" / f"{name}.exr")
-        shown = render(scene, camera, spp=spp, seed=seed + i)[..., :3] * (p["alpha"] > 0)[..., None]
+        shown = render(scene, camera, spp=spp, seed=seed + i, max_depth=depth)[..., :3] * (p["alpha"] > 0)[..., None]
         per_view[name]["novel_psnr"] = m.psnr(m.encode(shown), m.encode(picture[..., :3]), where)
     scaled = replace(asset.material, base_color=np.clip(asset.material.base_color * factor, 0, 1).astype(np.float32))
     for light_name in truth["relight"]:
         scene = scene_under(scaled, read_data(folder / "truth" / "relight" / f"{light_name}.exr")[..., :3])
         for i, (name, camera) in enumerate(cameras):
             picture = read_data(folder / "truth" / "relight" / light_name / f"{name}.exr")
-            shown = render(scene, camera, spp=spp, seed=seed + i)[..., :3] * (predicted[name]["alpha"] > 0)[..., None]
+            shown = render(scene, camera, spp=spp, seed=seed + i, max_depth=depth)[..., :3] * (predicted[name]["alpha"] > 0)[..., None]
             per_view[name][f"relit_psnr:{light_name}"] = m.psnr(m.encode(shown), m.encode(picture[..., :3]), inside[name])
     light = read_data(folder / "truth" / "environment.exr")[..., :3]
     values["environment_mse"] = m.environment_mse(asset.environment, light)
@@ -151,7 +151,7 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     }
 
 
-def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
+def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
     """Figures of a real photo: the photo re-rendered, and the rotations against SfD's poses where its `object_pred_pose.json` lies there.
 
     Those poses were found by structure from motion: a reference, not the truth. Raises UserError where the capture is no such photo.
@@ -206,7 +206,7 @@ def labelled_pixels(capture: Path, run: Path | None, focal: float) -> Pixels | N
     return None if source is None else open_duplicates(source, focal=focal).photos[0].load()
 
 
-def photo_figure(asset: Asset, capture: Path, *, run: Path | None = None, spp: int = 64, seed: int = 0) -> float:
+def photo_figure(asset: Asset, capture: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0) -> float:
     """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr). run: whose settings say where the labels are
     from."""
     from relit.evaluate.photos import shrunk

@@ -37,7 +37,7 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     folder = folder.parent if folder.name == "truth" and (folder / "settings.json").is_file() else folder
     kind = truth_kind(folder)
     if kind == "duplicates":
-        return evaluate_duplicates(run_or_asset, folder, spp=min(spp, 64), seed=seed)
+        return evaluate_duplicates(run_or_asset, folder, spp=spp, seed=seed)
     if is_flash_truth(folder):
         return evaluate_flash(run_or_asset, folder, spp=spp, seed=seed)
     asset = load_asset(run_or_asset)
@@ -48,7 +48,7 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     elif has_truth(folder):
         result = evaluate_asset(asset, load_truth(folder), spp=spp, seed=seed)
     elif asset.instances:
-        result = evaluate_on_photo(run_or_asset, folder, spp=min(spp, 64), seed=seed)
+        result = evaluate_on_photo(run_or_asset, folder, spp=spp, seed=seed)
     elif asset.lights:
         from relit.evaluate.collection_photos import evaluate_on_collection
 

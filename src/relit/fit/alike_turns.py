@@ -40,11 +40,9 @@ def alike_turns(gallery: Gallery, count: int) -> list[AlikeTurn]:
     """The turns (at most `count`, the likest first) by which the model of a gallery looks most like itself."""
     likeness = likeness_in(gallery)
     tried = []
-    for order in ORDERS:
-        for axis in directions_around(AXES):
-            if order > 2 or axis[1] >= 0:
-                rotation = exp_so3(2 * np.pi / order * axis)
-                tried.append((likeness(rotation), rotation))
+    for axis in directions_around(AXES):
+        if axis[1] >= 0:  # the others' turns are these turns' inverses
+            tried += [(likeness(rotation), rotation) for rotation in (exp_so3(2 * np.pi / order * axis) for order in ORDERS)]
     settled: list[tuple[float, np.ndarray]] = []
     for _, start in apart(tried, SETTLED):
         simplex = np.concatenate([np.zeros((1, 3)), STEP * np.eye(3)])

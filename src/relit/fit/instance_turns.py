@@ -26,7 +26,7 @@ from relit.fit.instance_rounds import model_of_all
 from relit.fit.instances import View, eyes_at, overlaps
 from relit.fit.joint_alignment import tangents
 from relit.fit.register import Crop, Rings, chosen_rings, directions_around, refine, views_from
-from relit.fit.silhouette_turns import Silhouettes
+from relit.fit.silhouette_turns import FINE, NODES, Silhouettes
 from relit.geometry.hull import NoShape
 
 TRIED = 3  # turns by which the model looks most like itself
@@ -51,28 +51,32 @@ class Turned:
 
 
 def coherent_turns(
-    views: list[View], crops: list[Crop], rings: Rings, poses: np.ndarray, o: Search, *, seed: int, say=lambda text: None
+    views: list[View], crops: list[Crop], rings: Rings, poses: np.ndarray, o: Search, *, seed: int, exact=False, say=lambda text: None
 ) -> Turned | None:
     """The instances, some of them turned by one of the turns by which the object nearly looks like itself; None where none had to be.
-    rings: of the crops under DETAILED."""
+    rings: of the crops under DETAILED. exact: the poses are those of a fine model, which coarse ones would lead away: they are turned, but
+    do not move."""
     try:
         body = model_at(views, poses, o, seed)
-        first: Turned | None = None
-        for turn in alike_turns(body.gallery, TRIED):
-            sought = by_silhouettes(views, crops, rings, body, turn, o, seed)
+    except NoShape:
+        return None
+    first: Turned | None = None
+    for turn in alike_turns(body.gallery, TRIED):
+        try:
+            sought = by_silhouettes(views, crops, rings, body, poses if exact else body.poses, turn, o, seed, exact)
             if sought is None:
                 continue
-            first = first or judged(views, crops, rings, poses, o, seed)
-            best = one_at_a_time(views, crops, rings, sought, turn, o, seed)
-            if best.value > first.value + GAIN:
-                moved = int(sum(rotation_angle(a[:3, :3].T @ b[:3, :3]) > NEAR for a, b in zip(best.poses, poses, strict=True)))
-                say(
-                    f"{min(moved, len(views) - moved)} of {len(views)} were turned by a turn by which the object looks like itself (a "
-                    f"circle's part of {turn.order}): they agree better by {best.value - first.value:.3f}"
-                )
-                return replace(best, rotations=motions_about(turn, np.zeros(3))[:, :3, :3])
-    except NoShape:
-        pass
+            first = first or judged(views, crops, rings, poses, o, seed, exact)
+            best = one_at_a_time(views, crops, rings, sought, turn, o, seed, exact)
+        except NoShape:  # turned so, the silhouettes have nothing in common
+            continue
+        if best.value > first.value + GAIN:
+            moved = int(sum(rotation_angle(a[:3, :3].T @ b[:3, :3]) > NEAR for a, b in zip(best.poses, poses, strict=True)))
+            say(
+                f"{min(moved, len(views) - moved)} of {len(views)} were turned by a turn by which the object looks like itself (a "
+                f"circle's part of {turn.order}): they agree better by {best.value - first.value:.3f}"
+            )
+            return replace(best, rotations=motions_about(turn, np.zeros(3))[:, :3, :3])
     return None
 
 
@@ -102,23 +106,24 @@ def settled(crops, rings: Rings, body: Body, poses: np.ndarray) -> np.ndarray:
     return refine(crops, poses, body.render, rings=rings, steps=(0, 4.0, 2.0), parts=DETAILED)[0]
 
 
-def by_silhouettes(views, crops, rings: Rings, body: Body, turn: AlikeTurn, o: Search, seed: int):
-    """Poses (N, 4, 4) after the turns that silhouettes ask for; None where they ask for none."""
-    moved = False
+def by_silhouettes(views, crops, rings: Rings, body: Body, poses: np.ndarray, turn: AlikeTurn, o: Search, seed: int, exact: bool):
+    """Poses (N, 4, 4) after the turns that silhouettes ask for; None where they ask for none. body: a model of all, `poses` those in it."""
+    moved, nodes = False, FINE if exact else NODES
     for trial in range(ROUNDS):
-        poses = settled(crops, rings, body, body.poses)
+        poses = poses if exact else settled(crops, rings, body, poses)
         placed, point = placed_axis(crops, rings, body, poses, turn)
         motions = motions_about(placed, point)
-        shapes = Silhouettes(views, poses, motions)
+        shapes = Silhouettes(views, poses, motions, nodes)
         gap, turns = shapes.most_coherent(seed + trial)
         if trial == 0 and turns.any():
             motions = motions_about(placed, axis_moved(views, poses, placed, point, turns))
-            shapes = Silhouettes(views, poses, motions)
+            shapes = Silhouettes(views, poses, motions, nodes)
             gap, turns = shapes.most_coherent(seed + trial)
         if not turns.any() or (trial == 0 and gap > shapes.gap(0 * turns) - CLEARLY):
             break
         moved, poses = True, motions[turns] @ poses
         body = model_at(views, poses, o, seed + trial + 1)
+        poses = poses if exact else body.poses
     return poses if moved else None
 
 
@@ -153,31 +158,31 @@ def axis_moved(views, poses: np.ndarray, turn: AlikeTurn, point: np.ndarray, tur
     return point + across @ found.x
 
 
-def judged(views, crops, rings: Rings, poses: np.ndarray, o: Search, seed: int) -> Turned:
-    """What a model of all says of poses after they have settled on models of all."""
-    for trial in range(SETTLED):
+def judged(views, crops, rings: Rings, poses: np.ndarray, o: Search, seed: int, exact: bool) -> Turned:
+    """What a model of all says of poses, after they have settled on models of all unless they are exact."""
+    for trial in range(0 if exact else SETTLED):
         body = model_at(views, poses, o, seed + trial)
         poses = settled(crops, rings, body, body.poses)
     render, own = model_of_all(views, poses, o, seed=seed)
     overlap = np.mean([overlaps(render, v, p[None])[0] for v, p in zip(views, poses, strict=True)])
-    gap = Silhouettes(views, poses, np.eye(4)[None]).gap(np.zeros(len(views), int))
+    gap = Silhouettes(views, poses, np.eye(4)[None], FINE if exact else NODES).gap(np.zeros(len(views), int))
     return Turned(poses, own, float(own.mean() + overlap - gap))
 
 
-def one_at_a_time(views, crops, rings: Rings, poses: np.ndarray, turn: AlikeTurn, o: Search, seed: int) -> Turned:
+def one_at_a_time(views, crops, rings: Rings, poses: np.ndarray, turn: AlikeTurn, o: Search, seed: int, exact: bool) -> Turned:
     """The best of those that differ in the turn of a single instance, again and again."""
-    best, none = judged(views, crops, rings, poses, o, seed), np.zeros(len(views), int)
+    best, none = judged(views, crops, rings, poses, o, seed, exact), np.zeros(len(views), int)
     for _ in range(SWEEPS):
         before = best
         body = model_at(views, best.poses, o, seed)
         motions = motions_about(*placed_axis(crops, rings, body, best.poses, turn))
-        shapes = Silhouettes(views, best.poses, motions)
+        shapes = Silhouettes(views, best.poses, motions, FINE if exact else NODES)
         ways = [(k, s) for k in range(len(views)) for s in range(1, len(motions))]
         ways.sort(key=lambda way: shapes.gap(np.where(np.arange(len(views)) == way[0], way[1], none)))
         for k, s in ways[:ASKED]:
             other = best.poses.copy()
             other[k] = motions[s] @ other[k]
-            tried = judged(views, crops, rings, other, o, seed)
+            tried = judged(views, crops, rings, other, o, seed, exact)
             if tried.value > best.value + NO_GAIN:
                 best = tried
         if best is before:

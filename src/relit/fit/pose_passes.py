@@ -14,13 +14,15 @@ from relit.cameras.se3 import rotation_angle, turns_apart
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import named
-from relit.fit.instance_options import Search
-from relit.fit.instances import View, carved, hold_distances, move_poses, moved_poses, pixel_bank
+from relit.fit.instance_options import DETAILED, Search
+from relit.fit.instance_turns import coherent_turns
+from relit.fit.instances import View, carved, crops_of, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
 from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
 from relit.fit.odd_instances import odd_instances
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
+from relit.fit.register import crop_rings
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh
@@ -41,13 +43,14 @@ CLOSE, CLOSER = 0.25, 0.8  # so was one that leaves textures within these pixels
 class Pass:
     """What a volume pass for the poses alone gives. poses: (N, 4, 4). odd: (N,) bool, who shows what does not agree with the model of all.
     turn: degrees by which it has turned the instances, the median. off: pixels, see `followed`. symmetry: of its shape; None where that is
-    not even."""
+    not even. mixed: whether instances were turned then by which the object nearly looks like itself: what it has built is of no use."""
 
     poses: np.ndarray
     odd: np.ndarray
     turn: float
     off: float | None
     symmetry: Symmetry | None
+    mixed: bool = False
 
     @property
     def exact(self) -> bool:
@@ -57,9 +60,9 @@ class Pass:
     def arrived(self, last: Pass | None) -> bool:
         """Whether another one would only lead the poses away again: textures brought them back to where they had been before, or as close
         together as flow can tell, or hardly closer than in the pass before."""
-        if self.off is None:
+        if self.off is None or self.mixed:
             return False
-        settled = last is not None and last.off is not None and self.off > CLOSER * last.off
+        settled = last is not None and last.off is not None and not last.mixed and self.off > CLOSER * last.off
         return settled or self.turn < ARRIVED or self.exact
 
 
@@ -87,26 +90,41 @@ def joint_stage(
     if run.done(name):
         saved = run_arrays(run, name, "joint")
         off = float(saved["off"]) if "off" in saved else None
-        return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved))
+        return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved), bool(saved.get("mixed", False)))
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
-        before, off = poses, None
+        before, off, turned = poses, None, None
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry)
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         if "textures" not in options.without:
-            better, moved, off = followed(mesh, [views[k] for k in np.flatnonzero(~odd)], poses[~odd], run, options)
+            some = [views[k] for k in np.flatnonzero(~odd)]
+            better, moved, off = followed(mesh, some, poses[~odd], run, options)
             if off is not None:
                 mesh, poses[~odd] = better, moved
+                turned = told_apart(some, moved, off, run, options, seed)
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
-        symmetry = None if "symmetry" in options.without else find_symmetry(mesh, views, poses)
+        symmetry = None if "symmetry" in options.without or turned is not None else find_symmetry(mesh, views, poses)
         if number == 0 and symmetry is not None:
             run.say("the object is its own mirror image: its silhouettes bound it from both sides")
+        if turned is not None:
+            poses[~odd] = turned
         kept = {} if off is None else {"off": off}
-        stage.save("joint", poses=poses, odd=odd, turn=turn, **kept, **(symmetry.arrays if symmetry else {}))
-    return Pass(poses, odd, turn, off, symmetry)
+        stage.save("joint", poses=poses, odd=odd, turn=turn, mixed=turned is not None, **kept, **(symmetry.arrays if symmetry else {}))
+    return Pass(poses, odd, turn, off, symmetry, turned is not None)
+
+
+def told_apart(views: list[View], poses: np.ndarray, off: float, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
+    """The poses (N, 4, 4) with those turned that stand wrong by a turn by which the object nearly looks like itself
+    (`fit.instance_turns.coherent_turns`); None where there are none, or where textures lie on one another (off: see `followed`): then none
+    is asked. Poses are exact by now, and silhouettes tell the more for it."""
+    if off < CLOSE or len(views) < 4 or "search" in options.without:
+        return None
+    crops = crops_of(views)
+    turned = coherent_turns(views, crops, crop_rings(crops, DETAILED), poses, Search(), seed=seed, exact=True, say=run.say)
+    return None if turned is None else turned.poses
 
 
 def followed(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray, float | None]:

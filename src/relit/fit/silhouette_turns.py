@@ -13,9 +13,8 @@ import numpy as np
 from relit.fit.instances import View, nearest_pixels
 from relit.geometry.sdf import node_positions
 
-NODES = 64
+NODES, FINE = 64, 96  # a side; of poses that are exact
 STRICT = 0.02  # share of the views that may show background where the body is
-CLOSED = np.ones((5, 5), np.uint8)  # pixels between nodes
 STARTS, FEWEST = 12, 2  # sets of turns that are descended from, all but the first drawn; fewer of many views, down to these
 ASKED = 120  # turns of single views, of all sets together in one sweep
 SWEEPS = 8  # of each descent, at most
@@ -28,6 +27,7 @@ class Silhouettes:
         p = node_positions(nodes).reshape(-1, 3)
         p = p[(p**2).sum(1) < 0.98]
         self.views, self.count = views, len(motions)
+        self.kernels = [closing(v, float(np.linalg.norm(pose[:3, 3])), nodes) for v, pose in zip(views, poses, strict=True)]
         shape = (len(views), len(motions), len(p))
         self.pixel, self.told, self.out = np.zeros(shape, np.int32), np.zeros(shape, bool), np.zeros(shape, bool)
         for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
@@ -51,7 +51,7 @@ class Silhouettes:
         for k, view in enumerate(self.views):
             body = np.zeros(view.mask.size, np.uint8)
             body[self.pixel[k, turns[k], inside]] = 1
-            body = cv2.morphologyEx(body.reshape(view.mask.shape), cv2.MORPH_CLOSE, CLOSED) > 0
+            body = cv2.morphologyEx(body.reshape(view.mask.shape), cv2.MORPH_CLOSE, self.kernels[k]) > 0
             own, known = view.mask > 0.5, view.known > 0.5
             found.append(((own ^ body) & known).sum() / max(((own | body) & known).sum(), 1))
         return found
@@ -81,3 +81,9 @@ class Silhouettes:
         count = int(np.clip(ASKED // (n * max(1, self.count - 1)), FEWEST, STARTS))
         starts = [np.zeros(n, int)] + [np.concatenate([[0], rng.integers(0, self.count, n - 1)]) for _ in range(count - 1)]
         return min((self.descended(s) for s in starts), key=lambda one: one[0])
+
+
+def closing(view: View, distance: float, nodes: int) -> np.ndarray:
+    """What closes the pixels between the nodes of a grid of so many a side, seen from that distance."""
+    apart = int(np.ceil(2 / (nodes - 1) * view.camera.fx / distance))
+    return np.ones((2 * (apart // 2 + 1) + 1,) * 2, np.uint8)
