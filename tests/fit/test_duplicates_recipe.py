@@ -260,15 +260,17 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     """Who is left out of one pass is not in the next; at most PASSES are made. Poses that textures had to lead back are to stay then."""
     asked = []
 
-    def passes(*told: tuple[float, float | None]):
-        """(poses, odd, arrived, the last pass), asked for passes which turn all by so many degrees, and leave textures so far off."""
+    def passes(*told: tuple):
+        """(poses, odd, arrived, the last pass), asked for passes which turn all by so many degrees, and leave textures so far off; and
+        whether some were half a turn off then."""
         asked.clear()
 
         def stage(views, poses, number, run, options, seed, symmetry):
             asked.append(list(views))
             assert symmetry == (number or None)  # that of the pass before
             odd = np.array([v == "b" for v in views])
-            return pose_passes.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, *told[number], number + 1)
+            turn, off, *mixed = told[number]
+            return pose_passes.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, turn, off, number + 1, *mixed)
 
         monkeypatch.setattr(pose_passes, "joint_stage", stage)
         return pose_passes.joint_stages(["a", "b", "c"], start, None, None, 0)
@@ -282,6 +284,7 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     _, _, arrived, last = passes((2, 3.0), (2, 0.2))
     assert arrived and last.exact and len(asked) == 2, "textures lie on one another"
     assert passes((2, 0.6), (2, 0.55))[2] and len(asked) == 2, "textures come no closer"
+    assert passes((0.1, 0.2, True), (2, 0.3), (2, 0.2))[2] and len(asked) == 3, "what was mixed tells nothing of what follows"
     assert not passes((2, 3.0), (2, 2.0), (2, 1.0), (2, 0.5))[2] and len(asked) == pose_passes.PASSES, "still on their way"
 
 

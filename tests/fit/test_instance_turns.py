@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from test_mirror_plane import views_of_body
 
 from relit.cameras.se3 import exp_so3, rotation_angle
 from relit.conventions import similarity
-from relit.fit import instance_search, instance_turns
+from relit.fit import instance_search, instance_turns, pose_passes
 from relit.fit.alike_turns import AlikeTurn, alike_turns, apart
+from relit.fit.duplicates_options import options_for
 from relit.fit.instance_options import DETAILED, Search
 from relit.fit.instance_regrowth import Placed
 from relit.fit.instance_turns import Turned, axis_moved, coherent_turns, model_at, motions_about, stands
@@ -99,6 +101,33 @@ def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monk
     astray = found.poses.copy()
     astray[3] = similarity(exp_so3(np.array([0.9, 0, 0.4])), np.zeros(3)) @ astray[3]
     assert not stands(views, crops, rings, Turned(astray, found.own, found.value, found.rotations), 3, Search(), 0)
+
+
+def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
+    """Whose textures lie on one another are not asked."""
+    monkeypatch.setattr(instance_turns, "ASKED", 1)
+    views, poses = pots
+    crops, off = crops_of(views), turned(poses, WRONG)
+    found = coherent_turns(views, crops, crop_rings(crops, DETAILED), off, Search(), seed=0, exact=True)
+    assert errors(found.poses, poses).max() < 3
+    moved = (found.poses != off).any((1, 2))
+    assert moved.sum() == 4, "the others stand as they did"
+    run, options = SimpleNamespace(say=lambda text: None), options_for("draft")
+    monkeypatch.setattr(pose_passes, "coherent_turns", lambda *_, exact, **__: found if exact else None)
+    assert pose_passes.told_apart(views, off, 1.0, run, options, 0) is found.poses
+    assert pose_passes.told_apart(views, off, 0.1, run, options, 0) is None
+    assert pose_passes.told_apart(views, off, 1.0, run, replace(options, without=("search",)), 0) is None
+
+
+def test_a_finer_view_closes_wider_gaps_between_nodes(pots):
+    views, poses = pots
+    body = Silhouettes(views, poses, np.eye(4)[None]).gap(np.zeros(8, int))
+    larger = [replace(v, camera=v.camera.resized(*(3 * n for n in v.mask.shape[::-1])), **enlarged(v, 3)) for v in views]
+    assert abs(Silhouettes(larger, poses, np.eye(4)[None]).gap(np.zeros(8, int)) - body) < 0.06
+
+
+def enlarged(view, times):
+    return {name: np.kron(getattr(view, name), np.ones((times, times), np.float32)) for name in ("mask", "known")}
 
 
 def test_an_object_that_looks_like_itself_all_the_way_is_left_alone(monkeypatch):
