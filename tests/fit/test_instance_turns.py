@@ -122,7 +122,7 @@ def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
 def test_a_finer_view_closes_wider_gaps_between_nodes(pots):
     views, poses = pots
     body = Silhouettes(views, poses, np.eye(4)[None]).gap(np.zeros(8, int))
-    larger = [replace(v, camera=v.camera.resized(*(3 * n for n in v.mask.shape[::-1])), **enlarged(v, 3)) for v in views]
+    larger = [replace(v, camera=v.camera.resized(*(6 * n for n in v.mask.shape[::-1])), **enlarged(v, 6)) for v in views]
     assert abs(Silhouettes(larger, poses, np.eye(4)[None]).gap(np.zeros(8, int)) - body) < 0.06
 
 
