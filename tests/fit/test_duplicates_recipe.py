@@ -265,9 +265,9 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
         whether some were half a turn off then."""
         asked.clear()
 
-        def stage(views, poses, number, run, options, seed, symmetry):
+        def stage(views, poses, number, run, options, seed, last):
             asked.append(list(views))
-            assert symmetry == (number or None)  # that of the pass before
+            assert (last and last.symmetry) == (number or None)  # the pass before
             odd = np.array([v == "b" for v in views])
             turn, off, *mixed = told[number]
             return pose_passes.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, turn, off, number + 1, *mixed)

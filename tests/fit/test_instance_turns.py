@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from test_mirror_plane import views_of_body
 
 from relit.cameras.se3 import exp_so3, rotation_angle
@@ -20,6 +21,7 @@ from relit.fit.instance_turns import Turned, axis_moved, coherent_turns, model_a
 from relit.fit.instances import crops_of
 from relit.fit.register import crop_rings
 from relit.fit.silhouette_turns import Silhouettes
+from relit.scene import Mesh
 
 BODY = (np.zeros(3), np.array([0.4, 0.3, 0.4]))
 SPOUT = (np.array([0.5, 0.1, 0.0]), np.array([0.22, 0.06, 0.06]))
@@ -104,7 +106,6 @@ def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monk
 
 
 def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
-    """Whose textures lie on one another are not asked."""
     monkeypatch.setattr(instance_turns, "ASKED", 1)
     views, poses = pots
     crops, off = crops_of(views), turned(poses, WRONG)
@@ -114,9 +115,11 @@ def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
     assert moved.sum() == 4, "the others stand as they did"
     run, options = SimpleNamespace(say=lambda text: None), options_for("draft")
     monkeypatch.setattr(pose_passes, "coherent_turns", lambda *_, exact, **__: found if exact else None)
-    assert pose_passes.told_apart(views, off, 1.0, run, options, 0) is found.poses
-    assert pose_passes.told_apart(views, off, 0.1, run, options, 0) is None
-    assert pose_passes.told_apart(views, off, 1.0, run, replace(options, without=("search",)), 0) is None
+    mesh, rod = (Mesh(s.vertices, s.faces) for s in (trimesh.creation.box((1.2, 0.7, 0.4)), trimesh.creation.cylinder(0.3, 1.2)))
+    assert pose_passes.told_apart(mesh, views, off, run, options, 0) is found.poses
+    assert pose_passes.told_apart(rod, views, off, run, options, 0) is None
+    assert pose_passes.told_apart(mesh, views[:3], off[:3], run, options, 0) is None
+    assert pose_passes.told_apart(mesh, views, off, run, replace(options, without=("search",)), 0) is None
 
 
 def test_a_finer_view_closes_wider_gaps_between_nodes(pots):

@@ -23,6 +23,7 @@ from relit.fit.odd_instances import odd_instances
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.register import crop_rings
+from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh
@@ -73,7 +74,7 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     poses, odd, last, arrived = poses.copy(), np.zeros(len(views), bool), None, False
     for number in range(PASSES):
         rest = np.flatnonzero(~odd)
-        one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last and last.symmetry)
+        one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last)
         poses[rest], odd[rest] = one.poses, one.odd
         last, arrived = one, one.arrived(last)
         if arrived or one.off is None:
@@ -81,10 +82,8 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     return poses, odd, arrived, last
 
 
-def joint_stage(
-    views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, symmetry: Symmetry | None
-) -> Pass:
-    """One such pass. symmetry: of the shape of the one before. Textures are asked here already: what the pass has built in the wrong place
+def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, last: Pass | None) -> Pass:
+    """One such pass. last: the one before. Textures are asked here already: what the pass has built in the wrong place
     it does not take back."""
     name = JOINT[number]
     if run.done(name):
@@ -94,7 +93,7 @@ def joint_stage(
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
         before, off, turned = poses, None, None
-        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry)
+        model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, last and last.symmetry)
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
@@ -104,7 +103,8 @@ def joint_stage(
             better, moved, off = followed(mesh, some, poses[~odd], run, options)
             if off is not None:
                 mesh, poses[~odd] = better, moved
-                turned = told_apart(some, moved, off, run, options, seed)
+                if off >= CLOSE or (last and last.mixed):  # or textures lie on one another: all stand right
+                    turned = told_apart(mesh, some, moved, run, options, seed)
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
         symmetry = None if "symmetry" in options.without or turned is not None else find_symmetry(mesh, views, poses)
         if number == 0 and symmetry is not None:
@@ -116,11 +116,11 @@ def joint_stage(
     return Pass(poses, odd, turn, off, symmetry, turned is not None)
 
 
-def told_apart(views: list[View], poses: np.ndarray, off: float, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
+def told_apart(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
     """The poses (N, 4, 4) with those turned that stand wrong by a turn by which the object nearly looks like itself
-    (`fit.instance_turns.coherent_turns`); None where there are none, or where textures lie on one another (off: see `followed`): then none
-    is asked. Poses are exact by now, and silhouettes tell the more for it."""
-    if off < CLOSE or len(views) < 4 or "search" in options.without:
+    (`fit.instance_turns.coherent_turns`); None where there are none. Poses are exact by now, so that silhouettes tell more. Bodies of
+    revolution are turned by their decoration (fit/instance_revolution.py), and not asked. mesh: of the pass."""
+    if len(views) < 4 or "search" in options.without or body_axis(mesh) is not None:
         return None
     crops = crops_of(views)
     turned = coherent_turns(views, crops, crop_rings(crops, DETAILED), poses, Search(), seed=seed, exact=True, say=run.say)
