@@ -70,7 +70,7 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
 }
 
 
-def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
+def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
     """Every figure that the truth allows, as `evaluate.protocols.evaluate`. Raises UserError where the truth is unfinished."""
     from relit.asset.asset import load_asset, read_json
     from relit.images import read_data
@@ -151,7 +151,7 @@ def evaluate_duplicates(run: str | Path, truth_folder: str | Path, *, spp: int =
     }
 
 
-def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
+def evaluate_on_photo(run: str | Path, capture: str | Path, *, spp: int = 64, seed: int = 0) -> dict[str, Any]:
     """Figures of a real photo: the photo re-rendered, and the rotations against SfD's poses where its `object_pred_pose.json` lies there.
 
     Those poses were found by structure from motion: a reference, not the truth. Raises UserError where the capture is no such photo.
@@ -206,7 +206,7 @@ def labelled_pixels(capture: Path, run: Path | None, focal: float) -> Pixels | N
     return None if source is None else open_duplicates(source, focal=focal).photos[0].load()
 
 
-def photo_figure(asset: Asset, capture: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0) -> float:
+def photo_figure(asset: Asset, capture: Path, *, run: Path | None = None, spp: int = 64, seed: int = 0) -> float:
     """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr). run: whose settings say where the labels are
     from."""
     from relit.evaluate.photos import shrunk

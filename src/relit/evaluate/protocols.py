@@ -20,12 +20,15 @@ from relit.evaluate.surfaces import chamfer_figures
 from relit.evaluate.truth import Truth, camera_key, has_truth, load_truth, truth_kind
 from relit.scene import Asset, Camera
 
+SPP, SPP_PILE = 256, 64
 
-def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
+
+def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int | None = None, seed: int = 0) -> dict[str, Any]:
     """Every figure that the truth allows, for the asset in a run or asset folder. truth_folder: what `relit synthesize` wrote; or the
     capture that the asset was made from, whose photos are the truth then (evaluate/photos.py, evaluate/collection_photos.py).
 
-    spp: samples a pixel of the pictures that are compared; their noise counts as error. Returns {"metrics": {name: {"value", "unit",
+    spp: samples a pixel of the pictures that are compared, SPP where none are asked for (of piles SPP_PILE, whose pictures take long);
+    their noise counts as error. Returns {"metrics": {name: {"value", "unit",
     "definition"}}, "per_view": {view: {name: value}}, "albedo_scale": [r, g, b], "alignment": "identity" or "sim3"}.
     Call `relit.device.use_device` first.
     """
@@ -36,8 +39,9 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     folder = Path(truth_folder)
     folder = folder.parent if folder.name == "truth" and (folder / "settings.json").is_file() else folder
     kind = truth_kind(folder)
+    few, spp = (SPP_PILE, SPP) if spp is None else (spp, spp)
     if kind == "duplicates":
-        return evaluate_duplicates(run_or_asset, folder, spp=spp, seed=seed)
+        return evaluate_duplicates(run_or_asset, folder, spp=few, seed=seed)
     if is_flash_truth(folder):
         return evaluate_flash(run_or_asset, folder, spp=spp, seed=seed)
     asset = load_asset(run_or_asset)
@@ -48,7 +52,7 @@ def evaluate(run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 2
     elif has_truth(folder):
         result = evaluate_asset(asset, load_truth(folder), spp=spp, seed=seed)
     elif asset.instances:
-        result = evaluate_on_photo(run_or_asset, folder, spp=spp, seed=seed)
+        result = evaluate_on_photo(run_or_asset, folder, spp=few, seed=seed)
     elif asset.lights:
         from relit.evaluate.collection_photos import evaluate_on_collection
 

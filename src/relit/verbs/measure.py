@@ -15,7 +15,9 @@ def evaluate_flags(parser: Parser) -> None:
     parser.common.add_argument("--truth", required=True, type=Path, metavar="DIR", help=truth)
     parser.common.add_argument("--json", type=Path, default=None, metavar="FILE", help="write the figures there")
     parser.common.add_argument("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
-    parser.more.add_argument("--spp", type=int, default=256, help="samples a pixel of the compared pictures (default 256)")
+    parser.more.add_argument(
+        "--spp", type=int, default=None, help="samples a pixel of the compared pictures (default 256; of piles of duplicates 64)"
+    )
 
 
 def do_evaluate(args) -> None:
