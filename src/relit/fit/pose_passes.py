@@ -73,13 +73,10 @@ def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesO
     the model of all. A shape that grew up with better poses is sharper, and moves them on."""
     poses, odd, last, arrived = poses.copy(), np.zeros(len(views), bool), None, False
     for number in range(PASSES):
-        rest, before = np.flatnonzero(~odd), poses.copy()
+        rest = np.flatnonzero(~odd)
         one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last)
         poses[rest], odd[rest] = one.poses, one.odd
-        arrived = one.arrived(last)
-        if arrived and last is not None and not last.mixed and last.off < one.off:  # led away again: as the pass before had them
-            return before, odd, arrived, last
-        last = one
+        last, arrived = one, one.arrived(last)
         if arrived or one.off is None:
             break
     return poses, odd, arrived, last
