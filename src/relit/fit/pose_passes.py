@@ -103,7 +103,7 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
             better, moved, off = followed(mesh, some, poses[~odd], run, options)
             if off is not None:
                 mesh, poses[~odd] = better, moved
-                if off >= CLOSE or (last and last.mixed):  # or textures lie on one another: all stand right
+                if off >= CLOSE or (last and last.mixed):  # where textures lie on one another all stand right, but after a mixed pass
                     turned = told_apart(mesh, some, moved, run, options, seed)
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
         symmetry = None if "symmetry" in options.without or turned is not None else find_symmetry(mesh, views, poses)
