@@ -8,6 +8,8 @@ structure in two directions whose surroundings then look alike.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -72,7 +74,17 @@ def texture_shifts(mesh: Mesh, cameras: list[Camera], pictures: list[np.ndarray]
     shown = [shown_by(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
     tint = tint_of(pictures, masks)
     channels = [channels_of(p, tint) for p in pictures]
-    return [one for i, j in neighbours(cameras) for one in shifts_of(mesh, scene, i, j, shown[i], cameras, channels, masks[j])]
+    pairs = [(i, j, shown[i], masks[j]) for i, j in neighbours(cameras)]
+    return shifts_between(mesh, scene, pairs, cameras, channels)
+
+
+def shifts_between(mesh: Mesh, scene, pairs: list[tuple[int, int, Shown, np.ndarray]], cameras: list[Camera], channels) -> list[Shifts]:
+    """Of each pair of views i, j: what i shows, and the mask (h, w) of j. channels: (h, w, C) of each view; each that has structure
+    counts for itself."""
+    met = [met_by(scene, shown, cameras[j], mask) for _, j, shown, mask in pairs]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # OpenCV and numpy let go of the interpreter
+        found = list(pool.map(lambda pair, there: flows_of(pair[2], channels[pair[0]], channels[pair[1]], *there), pairs, met))
+    return [shifts_of(mesh, scene, i, j, cameras[i], *flow) for (i, j, *_), flows in zip(pairs, found, strict=True) for flow in flows]
 
 
 def misfit(shifts: list[Shifts]) -> float:
@@ -123,28 +135,31 @@ def places_of(mesh: Mesh, scene, camera: Camera, x: np.ndarray, y: np.ndarray):
     return hit, corners, weights, point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
 
 
-def shifts_of(mesh: Mesh, scene, i: int, j: int, shown: Shown, cameras: list[Camera], channels, mask: np.ndarray) -> list[Shifts]:
-    """Of view i, which shows `shown`, against view j with its mask; of each of their channels (h, w, C) that has structure."""
-    both, x, y = met_by(scene, shown, cameras[j], mask)
+def flows_of(shown: Shown, here: np.ndarray, there: np.ndarray, both: np.ndarray, x: np.ndarray, y: np.ndarray) -> list:
+    """Of a view that shows `shown` against another one; of each of their channels, here and there (h, w, C), that has structure: rows and
+    columns (N,) of at most SAMPLES pixels, flow (N, 2) and structure (N,) there. both, x, y: see `met_by`."""
     out = []
     if both.sum() < OVERLAP:
         return out
     (top, bottom), (left, right) = ((a.min(), a.max() + 1) for a in np.nonzero(both))
     box = np.s_[top:bottom, left:right]
-    for here, there in zip(np.moveaxis(channels[i], -1, 0), np.moveaxis(channels[j], -1, 0), strict=True):
-        brought = brought_to(shown, there, x, y)
-        flow, structure = confirmed_flow(contrasts(here[box], both[box]), contrasts(brought[box], both[box]), both[box])
+    for mine, other in zip(np.moveaxis(here, -1, 0), np.moveaxis(there, -1, 0), strict=True):
+        brought = brought_to(shown, other, x, y)
+        flow, structure = confirmed_flow(contrasts(mine[box], both[box]), contrasts(brought[box], both[box]), both[box])
         row, column = np.nonzero(structure)
         if len(row) < LEAST:
             continue
         chosen = np.unique(np.linspace(0, len(row) - 1, min(SAMPLES, len(row))).round().astype(int))
         row, column = row[chosen], column[chosen]
-        shift, structure = flow[row, column].astype(np.float64), structure[row, column]
-        row, column = row + top, column + left
-        # where the other shows that place now
-        hit, *places = places_of(mesh, scene, cameras[i], column + 0.5 + shift[:, 0], row + 0.5 + shift[:, 1])
-        out.append(Shifts(i, j, *(a[hit] for a in (*places, -shift, structure))))
+        out.append((row + top, column + left, flow[row, column].astype(np.float64), structure[row, column]))
     return out
+
+
+def shifts_of(mesh: Mesh, scene, i: int, j: int, camera: Camera, row, column, flow: np.ndarray, structure: np.ndarray) -> Shifts:
+    """Of view i against view j, from their flow (see `flows_of`). camera: of view i."""
+    # where the other shows that place now
+    hit, *places = places_of(mesh, scene, camera, column + 0.5 + flow[:, 0], row + 0.5 + flow[:, 1])
+    return Shifts(i, j, *(a[hit] for a in (*places, -flow, structure)))
 
 
 def met_by(scene, shown: Shown, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

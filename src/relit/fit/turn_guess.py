@@ -31,7 +31,7 @@ from relit.fit.texture_shifts import (
     clear_of,
     contrasts,
     met_by,
-    shifts_of,
+    shifts_between,
     shown_by,
     structure_of,
     texture_shifts,
@@ -162,7 +162,7 @@ def descended_alike(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
         cameras, cosines = [camera, *others.cameras], cosines_to(others, camera)
         near = [k + 1 for k in np.argsort(-cosines)[:NEIGHBOURS] if cosines[k] > np.cos(np.radians(ACROSS))]
         pairs = [(0, k, shown, others.masks[k - 1]) for k in near] + [(k, 0, others.shown[k - 1], mask) for k in near]
-        shifts = [s for i, j, seen, there in pairs for s in shifts_of(others.mesh, others.scene, i, j, seen, cameras, channels, there)]
+        shifts = shifts_between(others.mesh, others.scene, pairs, cameras, channels)
         rows, _ = outline_rows(others.mesh, [camera], [view.mask], [view.known], LABELS)
         rows += [replace(r, poses=[one for one in r.poses if one[0][0] == 0]) for r in (texture_rows(shifts, cameras) if shifts else [])]
         camera = solved(others.mesh, [camera], rows, still=True)[1][0]
