@@ -8,6 +8,7 @@ import pytest
 from relit.capture import open_capture
 from relit.fit import first_material as first
 from relit.fit.multiview import MultiviewOptions, reconstruct
+from relit.fit.surface import SurfaceOptions
 from relit.run import Run
 
 SMALL = MultiviewOptions(
@@ -133,3 +134,16 @@ def test_a_dull_start_is_taken_where_the_short_fit_is_better(tmp_path, monkeypat
     monkeypatch.setattr(first, "explained_better", lambda paint, metal, dull: (paint[:, 0] < 0, paint[:, 0] >= 0))
     _, begun = found(tmp_path, (0.0, 0.0), surface_steps=2)
     assert min(begun) > 0.55, begun
+
+
+@pytest.mark.parametrize("metallic, dullness, fits", [(0.1, False, 2), (0.1, True, 3), (0.9, False, 3)])
+def test_the_fit_that_tells_dull_paint_is_spared_where_nothing_asks_for_it(monkeypatch, metallic, dullness, fits):
+    """It is made where dullness is asked for, and where it may stand against metal."""
+    begun = []
+    monkeypatch.setattr(first, "start_surface", lambda *a: begun.append(a[3].roughness_start))
+    monkeypatch.setattr(first, "fit_surface", lambda *a: None)
+    monkeypatch.setattr(first, "errors", lambda *a: np.array([[1.0 - 0.4 * (len(begun) == 2) * (metallic > 0.5), 10 * metallic, 10]]))
+    base, known = np.full((8, 8, 3), 0.5, np.float32), np.ones((8, 8), bool)
+    start, roughness = first.first_material(None, None, base, known, 1.0, None, SurfaceOptions(), dullness=dullness)
+    assert len(begun) == fits
+    assert (start == (first.METAL if metallic > 0.5 else first.PAINT)).all() and (roughness == SurfaceOptions().roughness_start).all()

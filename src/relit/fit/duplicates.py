@@ -115,7 +115,8 @@ def surface_stage(shots, camera: Camera, mesh: Mesh, parts, run, options: Duplic
         metallic = PAINT
         if "first_material" not in options.without and stage.load("checkpoint") is None:
             # metal alone: each texel stands in many places under the light here, so that roughness finds its way from anywhere
-            metallic, _ = first_material(bank, traced, start, known, level, None, o, seed, run.progress("metal or paint"))
+            progress = run.progress("metal or paint")
+            metallic, _ = first_material(bank, traced, start, known, level, None, o, seed, progress, dullness=False)
             run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
         model = start_surface(start, known, level, o, None, metallic)
         if options.gaussians:

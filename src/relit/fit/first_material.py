@@ -57,21 +57,29 @@ def first_material(
     options: SurfaceOptions,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
+    dullness: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Metallic and roughness to begin with, (S, S) float32 each. base, known, radiance, normals: as of `start_surface`.
-    progress: told how many steps of all short fits are over."""
+    progress: told how many steps of all short fits are over. dullness: False where the roughness is not asked for; it is the usual one
+    then wherever nothing may be metal, as the fit that tells dull paint is spared."""
     stage = NoStage(progress)
     o = replace(options, steps=min(STEPS, options.steps // 2), exchange_rate=min(options.exchange_rate, MOST_EXCHANGE), **TRIAL)
     given = (base, known) if normals is None else (base, known, normals)
     small = [cv2.resize(np.asarray(a, np.float32), (TEXTURE, TEXTURE), interpolation=cv2.INTER_AREA) for a in given]
-    fits = []
-    for metallic, roughness in SIDES:
-        first = o if roughness is None else replace(o, roughness_start=roughness)
-        model = start_surface(small[0], small[1] > 0.5, radiance, first, None if normals is None else small[2], metallic)
-        fits.append(fit_surface(bank, mesh, model, o, stage, seed))
     colour = np.sqrt(np.maximum(base, 0) / max(float(base[known].mean()), 1e-6))
     centres, group = groups_of(colour, known)
-    paint, metal, dull = (errors(bank, mesh, f, o, centres, colour, seed) for f in fits)
+
+    def errors_from(side: tuple[float, float | None]) -> np.ndarray:
+        metallic, roughness = side
+        first = o if roughness is None else replace(o, roughness_start=roughness)
+        model = start_surface(small[0], small[1] > 0.5, radiance, first, None if normals is None else small[2], metallic)
+        fit_surface(bank, mesh, model, o, stage, seed)
+        return errors(bank, mesh, model, o, centres, colour, seed)
+
+    paint, metal = errors_from(SIDES[0]), errors_from(SIDES[1])
+    if not dullness and not may_be_metal(paint, metal).any():
+        return np.full(known.shape, PAINT, np.float32), np.full(known.shape, options.roughness_start, np.float32)
+    dull = errors_from(SIDES[2])
     is_metal, is_dull = explained_better(paint, metal, dull)
     metallic = np.where(is_metal[group] & known, METAL, PAINT)
     return metallic.astype(np.float32), np.where(is_dull[group] & known, DULL, options.roughness_start).astype(np.float32)
@@ -117,11 +125,16 @@ def explained_better(paint: np.ndarray, metal: np.ndarray, dull: np.ndarray) -> 
     from that side, also beside what gains most, and become more of a metal; dull: no metal, and explained better so. Fits as short as
     these leave the gain of one group uncertain by several hundredths; paint of one object is mostly alike, so half of what counts is the
     gain of all paint together. What clearly loses stays."""
-    gained = gain(paint, metal)
-    is_metal = (gained > max(GAIN, OF_BEST * gained.max())) & (metal[:, 1] > ROSE * metal[:, 2]) & (metal[:, 0] < dull[:, 0])
+    is_metal = may_be_metal(paint, metal) & (metal[:, 0] < dull[:, 0])
     together = gain(*(fit[~is_metal].sum(0, keepdims=True) for fit in (paint, dull)))
     alone = gain(paint, dull)
     return is_metal, ((alone + together) / 2 > DULL_GAIN) & (alone > -DULL_GAIN) & ~is_metal
+
+
+def may_be_metal(paint: np.ndarray, metal: np.ndarray) -> np.ndarray:
+    """(G,) which groups are metal unless dull paint explains them better: see `explained_better`."""
+    gained = gain(paint, metal)
+    return (gained > max(GAIN, OF_BEST * gained.max())) & (metal[:, 1] > ROSE * metal[:, 2])
 
 
 def gain(one: np.ndarray, other: np.ndarray) -> np.ndarray:
