@@ -50,24 +50,50 @@ class Turned:
     rotations: np.ndarray = field(default_factory=lambda: np.eye(3)[None])
 
 
+@dataclass(frozen=True)
+class Asked:
+    """Whose turns are asked. rings: of the crops under DETAILED. exact: the poses are those of a fine model, which coarse ones would lead
+    away: they are turned, but do not move."""
+
+    views: list[View]
+    crops: list[Crop]
+    rings: Rings
+    options: Search
+    seed: int
+    exact: bool
+
+    @property
+    def nodes(self) -> int:
+        """Of the body that silhouettes are held against, a side."""
+        return FINE if self.exact else NODES
+
+    def model(self, poses: np.ndarray, trial: int = 0) -> Body:
+        """A model of all, fitted to poses (N, 4, 4). Raises NoShape."""
+        return model_at(self.views, poses, self.options, self.seed + trial)
+
+    def settled(self, body: Body, poses: np.ndarray) -> np.ndarray:
+        """Poses (N, 4, 4) after a descent against a model."""
+        return refine(self.crops, poses, body.render, rings=self.rings, steps=(0, 4.0, 2.0), parts=DETAILED)[0]
+
+
 def coherent_turns(
     views: list[View], crops: list[Crop], rings: Rings, poses: np.ndarray, o: Search, *, seed: int, exact=False, say=lambda text: None
 ) -> Turned | None:
     """The instances, some of them turned by one of the turns by which the object nearly looks like itself; None where none had to be.
-    rings: of the crops under DETAILED. exact: the poses are those of a fine model, which coarse ones would lead away: they are turned, but
-    do not move."""
+    rings, exact: see `Asked`."""
+    asked = Asked(views, crops, rings, o, seed, exact)
     try:
-        body = model_at(views, poses, o, seed)
+        body = asked.model(poses)
     except NoShape:
         return None
     first: Turned | None = None
     for turn in alike_turns(body.gallery, TRIED):
         try:
-            sought = by_silhouettes(views, crops, rings, body, poses if exact else body.poses, turn, o, seed, exact)
+            sought = by_silhouettes(asked, body, poses if exact else body.poses, turn)
             if sought is None:
                 continue
-            first = first or judged(views, crops, rings, poses, o, seed, exact)
-            best = one_at_a_time(views, crops, rings, sought, turn, o, seed, exact)
+            first = first or judged(asked, poses)
+            best = one_at_a_time(asked, sought, turn)
         except NoShape:  # turned so, the silhouettes have nothing in common
             continue
         if best.value > first.value + GAIN:
@@ -102,28 +128,24 @@ def model_at(views, poses: np.ndarray, o: Search, seed: int) -> Body:
     return body_of(views, poses, cameras, DETAILED, o.growth, steps=o.growth.steps, seed=seed)
 
 
-def settled(crops, rings: Rings, body: Body, poses: np.ndarray) -> np.ndarray:
-    return refine(crops, poses, body.render, rings=rings, steps=(0, 4.0, 2.0), parts=DETAILED)[0]
-
-
-def by_silhouettes(views, crops, rings: Rings, body: Body, poses: np.ndarray, turn: AlikeTurn, o: Search, seed: int, exact: bool):
+def by_silhouettes(asked: Asked, body: Body, poses: np.ndarray, turn: AlikeTurn) -> np.ndarray | None:
     """Poses (N, 4, 4) after the turns that silhouettes ask for; None where they ask for none. body: a model of all, `poses` those in it."""
-    moved, nodes = False, FINE if exact else NODES
+    moved = False
     for trial in range(ROUNDS):
-        poses = poses if exact else settled(crops, rings, body, poses)
-        placed, point = placed_axis(crops, rings, body, poses, turn)
+        poses = poses if asked.exact else asked.settled(body, poses)
+        placed, point = placed_axis(asked, body, poses, turn)
         motions = motions_about(placed, point)
-        shapes = Silhouettes(views, poses, motions, nodes)
-        gap, turns = shapes.most_coherent(seed + trial)
+        shapes = Silhouettes(asked.views, poses, motions, asked.nodes)
+        gap, turns = shapes.most_coherent(asked.seed + trial)
         if trial == 0 and turns.any():
-            motions = motions_about(placed, axis_moved(views, poses, placed, point, turns))
-            shapes = Silhouettes(views, poses, motions, nodes)
-            gap, turns = shapes.most_coherent(seed + trial)
+            motions = motions_about(placed, axis_moved(asked.views, poses, placed, point, turns))
+            shapes = Silhouettes(asked.views, poses, motions, asked.nodes)
+            gap, turns = shapes.most_coherent(asked.seed + trial)
         if not turns.any() or (trial == 0 and gap > shapes.gap(0 * turns) - CLEARLY):
             break
         moved, poses = True, motions[turns] @ poses
-        body = model_at(views, poses, o, seed + trial + 1)
-        poses = poses if exact else body.poses
+        body = asked.model(poses, trial + 1)
+        poses = poses if asked.exact else body.poses
     return poses if moved else None
 
 
@@ -133,10 +155,10 @@ def motions_about(turn: AlikeTurn, point: np.ndarray) -> np.ndarray:
     return np.array([similarity(r, point - r @ point) for r in rotations])
 
 
-def placed_axis(crops, rings: Rings, body: Body, poses: np.ndarray, turn: AlikeTurn) -> tuple[AlikeTurn, np.ndarray]:
+def placed_axis(asked: Asked, body: Body, poses: np.ndarray, turn: AlikeTurn) -> tuple[AlikeTurn, np.ndarray]:
     """The turn, and a point of its axis, by which the model looks most like itself: all instances are registered from where it puts
     them."""
-    there = settled(crops, rings, body, np.array([similarity(turn.rotation(), np.zeros(3)) @ p for p in poses]))
+    there = asked.settled(body, np.array([similarity(turn.rotation(), np.zeros(3)) @ p for p in poses]))
     each = there @ np.linalg.inv(poses)
     near = np.array([rotation_angle(turn.rotation().T @ m[:3, :3]) < NEAR for m in each])
     if near.any():
@@ -158,31 +180,31 @@ def axis_moved(views, poses: np.ndarray, turn: AlikeTurn, point: np.ndarray, tur
     return point + across @ found.x
 
 
-def judged(views, crops, rings: Rings, poses: np.ndarray, o: Search, seed: int, exact: bool) -> Turned:
+def judged(asked: Asked, poses: np.ndarray) -> Turned:
     """What a model of all says of poses, after they have settled on models of all unless they are exact."""
-    for trial in range(0 if exact else SETTLED):
-        body = model_at(views, poses, o, seed + trial)
-        poses = settled(crops, rings, body, body.poses)
-    render, own = model_of_all(views, poses, o, seed=seed)
-    overlap = np.mean([overlaps(render, v, p[None])[0] for v, p in zip(views, poses, strict=True)])
-    gap = Silhouettes(views, poses, np.eye(4)[None], FINE if exact else NODES).gap(np.zeros(len(views), int))
+    for trial in range(0 if asked.exact else SETTLED):
+        body = asked.model(poses, trial)
+        poses = asked.settled(body, body.poses)
+    render, own = model_of_all(asked.views, poses, asked.options, seed=asked.seed)
+    overlap = np.mean([overlaps(render, v, p[None])[0] for v, p in zip(asked.views, poses, strict=True)])
+    gap = Silhouettes(asked.views, poses, np.eye(4)[None], asked.nodes).gap(np.zeros(len(poses), int))
     return Turned(poses, own, float(own.mean() + overlap - gap))
 
 
-def one_at_a_time(views, crops, rings: Rings, poses: np.ndarray, turn: AlikeTurn, o: Search, seed: int, exact: bool) -> Turned:
+def one_at_a_time(asked: Asked, poses: np.ndarray, turn: AlikeTurn) -> Turned:
     """The best of those that differ in the turn of a single instance, again and again."""
-    best, none = judged(views, crops, rings, poses, o, seed, exact), np.zeros(len(views), int)
+    count = len(poses)
+    best, none = judged(asked, poses), np.zeros(count, int)
     for _ in range(SWEEPS):
         before = best
-        body = model_at(views, best.poses, o, seed)
-        motions = motions_about(*placed_axis(crops, rings, body, best.poses, turn))
-        shapes = Silhouettes(views, best.poses, motions, FINE if exact else NODES)
-        ways = [(k, s) for k in range(len(views)) for s in range(1, len(motions))]
-        ways.sort(key=lambda way: shapes.gap(np.where(np.arange(len(views)) == way[0], way[1], none)))
+        motions = motions_about(*placed_axis(asked, asked.model(best.poses), best.poses, turn))
+        shapes = Silhouettes(asked.views, best.poses, motions, asked.nodes)
+        ways = [(k, s) for k in range(count) for s in range(1, len(motions))]
+        ways.sort(key=lambda way: shapes.gap(np.where(np.arange(count) == way[0], way[1], none)))
         for k, s in ways[:ASKED]:
             other = best.poses.copy()
             other[k] = motions[s] @ other[k]
-            tried = judged(views, crops, rings, other, o, seed, exact)
+            tried = judged(asked, other)
             if tried.value > best.value + NO_GAIN:
                 best = tried
         if best is before:
