@@ -203,6 +203,16 @@ def test_a_flash_capture_has_a_cost_of_its_own(capture):
     assert draft.seconds == pytest.approx(56, rel=0.2) and draft.memory < cost.memory < high.memory and cost.seconds < high.seconds
 
 
+def test_more_identical_objects_cost_more(capture):
+    """Ten Spots took 398 s and 1.6 GB, thirty 653 s and 2.1 GB, sixty 962 s and 2.6 GB; other objects up to 590 s and 2 GB."""
+    opened = open_input(capture, Job())
+    photo = replace(opened, photos=(replace(opened.photos[0], width=1600, height=1600),))
+    ten, thirty, sixty = (estimate(replace(photo, objects=n), Job(), "duplicates") for n in (10, 30, 60))
+    assert 398 < ten.seconds < 653 < thirty.seconds < 962 < sixty.seconds < 1300
+    assert 1.6e9 < ten.memory < 2.5e9 and 2.1e9 < thirty.memory < sixty.memory < 4e9
+    assert estimate(photo, Job(), "duplicates").seconds == ten.seconds  # of objects that are not known
+
+
 def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, monkeypatch):
     """`--capture auto` takes the kind that the reader told, and says so when there is no recipe for it."""
     import sys

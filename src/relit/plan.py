@@ -20,7 +20,8 @@ from relit.settings import read_config, with_values
 
 # The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture, run, options, seed) -> Asset,
 # and LIGHT (a phrase) and STAGES (names) for `relit inspect`. It may also hold FINDS_CAMERAS = True (photos without cameras come to it as
-# they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST (see MEASURED).
+# they are; otherwise structure from motion has found them), LEAST_PHOTOS (3 where absent), COST (see MEASURED), COST_OBJECTS (see
+# `estimate`).
 RECIPES = {
     "multiview": "relit.fit.multiview",
     "flash": "relit.fit.flash",
@@ -180,14 +181,19 @@ BYTES_PER_PIXEL = 40.0  # a decoded photo and its share of the pixel bank
 
 
 def estimate(capture: Capture, job: Job, kind: str = "multiview", options=None) -> Cost:
-    """Forecast from the number of photos, their pixels, the kind and the quality; before the job, so that it can be refused.
+    """Forecast from the number of photos, their pixels and objects, the kind and the quality; before the job, so that it can be refused.
 
-    options: of the recipe, by default those of the quality; photos are shrunk until all together have no more than its `max_pixels`.
+    options: of the recipe, by default those of the quality; photos are shrunk until all together have no more than its `max_pixels`. The
+    recipe's COST_OBJECTS: identical objects that its COST was measured with, and what each more adds, as shares of time and memory.
     """
     recipe = recipe_of(kind)
     pixels = sum(p.width * p.height for p in capture.photos)
     pixels = min(pixels, getattr(options or recipe.options_for(job.quality), "max_pixels", pixels))
     seconds, memory = getattr(recipe, "COST", MEASURED)[job.quality]
+    if capture.objects and hasattr(recipe, "COST_OBJECTS"):
+        usual, time_share, memory_share = recipe.COST_OBJECTS
+        seconds *= 1 + time_share * (capture.objects - usual)
+        memory *= 1 + memory_share * (capture.objects - usual)
     seconds += (len(capture.photos) - MEASURED_PHOTOS) * SECONDS_PER_PHOTO["load"]
     if not capture.has_cameras and not getattr(recipe, "FINDS_CAMERAS", False):
         seconds += len(capture.photos) * SECONDS_PER_PHOTO["cameras"]

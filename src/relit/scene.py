@@ -124,6 +124,7 @@ class Capture:
     black_background: True where pixels outside the masks are known to be black (alpha composites, dark rooms).
     notes: what the reader did that the user did not ask for, one sentence each.
     kind: the kind of capture where the layout of the files tells it ('flash', 'duplicates', 'collection'), else ''.
+    objects: views of identical objects in all photos together, 0 where no labels tell.
     """
 
     root: Path
@@ -136,6 +137,7 @@ class Capture:
     black_background: bool = False
     notes: tuple[str, ...] = field(default_factory=tuple)
     kind: str = ""
+    objects: int = 0
 
     @property
     def folder(self) -> Path:

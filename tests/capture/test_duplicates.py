@@ -50,7 +50,7 @@ def test_sfd_folder_with_focal_as_text_and_a_photo_that_is_not_square(tmp_path):
     assert capture.kind == "duplicates" and (camera.width, camera.height) == (W, H)
     assert camera.fx == 123.5 and camera.cx == W / 2
     assert np.allclose(camera.centre, [1, 2, 3]) and np.allclose(camera.world_from_camera[:3, 2], [0, 0, -1])
-    assert numbers(capture) == [0, 60, 100, 140]
+    assert numbers(capture) == [0, 60, 100, 140] and capture.objects == 3
 
 
 def test_normal_priors_in_the_axes_of_sfd_and_in_our_own(tmp_path):

@@ -131,18 +131,20 @@ def _is_coco(file: Path, photo: Path) -> bool:
 def open_duplicates(source: Source, *, focal: float | None = None, max_side: int | None = None) -> Capture:
     """The capture: each photo with its camera and labels. focal: pixels of the photo as stored, or None. Raises UserError (exit code 3)."""
     notes: list[str] = []
-    photos = []
+    photos, objects = [], 0
     for path, labels in ((source.photo, source.labels), *source.more):
         header = read_header(path)
         own, dropped = usable_labels(read_labels(labels, path, (header.height, header.width)), labels, source.root, path)
         named = f"{path.name}: " if source.more else ""
-        notes += [named + note for note in (*dropped, f"{len(np.unique(own[own > 0]))} objects in {labels.name}")]
+        count = len(np.unique(own[own > 0]))
+        notes += [named + note for note in (*dropped, f"{count} objects in {labels.name}")]
+        objects += count
         photos.append(labelled_photo(source, path, header, own, focal, max_side, notes))
     if source.labels.name == BOP_TRUTH:
         notes.append(f"the objects are those with obj_id {bop_object(read_json(source.labels))}, the commonest of the scene")
     if source.more:
         notes.append(f"{len(photos)} photos of one pile: nothing must stir between them")
-    return Capture(source.root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates")
+    return Capture(source.root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates", objects=objects)
 
 
 def open_segmented(path: Path, network: str, *, focal: float | None = None, max_side: int | None = None) -> Capture:
@@ -154,13 +156,15 @@ def open_segmented(path: Path, network: str, *, focal: float | None = None, max_
     if not files or not files[0].is_file():
         raise UserError("no photo was found", fix=f"give a photo or a folder of photos: {path}")
     root = path if path.is_dir() else path.parent
-    source, notes, photos = Source(root, files[0], Path(network), _cameras(root)), [], []
+    source, notes, photos, objects = Source(root, files[0], Path(network), _cameras(root)), [], [], 0
     segmenter = Network(network)
     for file in files:
         labels, dropped = usable_labels(found_instances(segmenter, read_image(file).rgb), file, root, file)
-        notes += [*dropped, f"{file.name}: {len(np.unique(labels[labels > 0]))} objects found by {Path(network).name}; look at them"]
+        count = len(np.unique(labels[labels > 0]))
+        notes += [*dropped, f"{file.name}: {count} objects found by {Path(network).name}; look at them"]
+        objects += count
         photos.append(labelled_photo(source, file, read_header(file), labels, focal, max_side, notes))
-    return Capture(root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates")
+    return Capture(root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates", objects=objects)
 
 
 def usable_labels(labels: np.ndarray, source: Path, root: Path, photo: Path) -> tuple[np.ndarray, list[str]]:

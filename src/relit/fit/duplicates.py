@@ -48,7 +48,8 @@ LIGHT = "several identical objects under one light are assumed (duplicates)"  # 
 STAGES = ("poses", "joint", "vessel", "volume", "mesh", "surface")
 FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
-COST = {"draft": (240.0, 1.9e9), "standard": (540.0, 2.0e9), "high": (1500.0, 3.0e9)}  # ten objects; most of it is the search for poses
+COST = {"draft": (240.0, 1.9e9), "standard": (540.0, 2.0e9), "high": (1500.0, 3.0e9)}  # most of it is the search for poses
+COST_OBJECTS = (10, 0.02, 0.008)  # objects of that, and what each more adds, as shares of time and of memory
 
 
 def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0) -> Asset:
