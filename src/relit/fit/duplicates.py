@@ -7,6 +7,7 @@
     volume    the same once more, from those poses; who was left out is sought in it          fit/sought_again.py, fit/turn_guess.py
     mesh       zero level set, decimated; mesh and poses as outlines and textures are; texture atlas; the ground      fit/joint_alignment.py
     surface    one material for all instances and one environment, light traced past all instances and the ground     fit/surface.py
+    turns      about the axis of a body of revolution, where they were guessed: as the photo shows them       fit/turns_as_shown.py
     asset      object, instances, ground and light in the frame of the user's camera
 
 SfD Sec. 3: ξ_obj_i = ξ_ref ∘ (ξ_cam_i)^-1. With one photo ξ_ref is the photo's camera, so instance i stands at world_from_camera
@@ -19,22 +20,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from relit.cameras.se3 import nearest_rotation, rotation_from
+from relit.cameras.se3 import nearest_rotation, rotation_angle, rotation_from
 from relit.capture.networks import Network, predicted_normals
 from relit.conventions import move_points, similarity
 from relit.errors import UserError
 from relit.fit.duplicates_options import DuplicatesOptions, options_for
-from relit.fit.duplicates_poses import all_views, poses_stage
+from relit.fit.duplicates_poses import all_views, named, poses_stage
 from relit.fit.duplicates_shape import shape_stages
 from relit.fit.first_material import PAINT, first_material
 from relit.fit.ground_paint import ground_as_shown
 from relit.fit.hidden_light import ASLANT, HiddenLight, hidden_from
-from relit.fit.instances import ANOTHER_PHOTO
+from relit.fit.instances import ANOTHER_PHOTO, View
 from relit.fit.lit_pile import lit_pile, surface_options
 from relit.fit.pile_scene import ground_colour, ground_reflectance, light_below
 from relit.fit.surface import ALBEDO_START, fit_surface, start_surface
+from relit.fit.turns_as_shown import turned_as_shown
 from relit.fit.unseen import seen_faces
 from relit.fit.unseen_paint import painted_over
+from relit.fit.vessels import body_axis
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
@@ -45,7 +48,7 @@ from relit.settings import check_levels
 
 __all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
 LIGHT = "several identical objects under one light are assumed (duplicates)"  # what `relit inspect` says
-STAGES = ("poses", "joint", "vessel", "volume", "mesh", "surface")
+STAGES = ("poses", "joint", "vessel", "volume", "mesh", "surface", "turns")
 FINDS_CAMERAS = True
 LEAST_PHOTOS = 1
 COST = {"draft": (240.0, 1.9e9), "standard": (540.0, 2.0e9), "high": (1500.0, 3.0e9)}  # most of it is the search for poses
@@ -74,7 +77,11 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     camera = photos[0].camera
     maps = run_arrays(run, "surface", "maps") if run.done("surface") else surface_stage(shots, camera, mesh, parts, run, options, seed)
-    asset = assemble(photos, mesh, maps, parts, dict(zip(keys.tolist(), unsure.tolist(), strict=True)))
+    doubts = dict(zip(keys.tolist(), unsure.tolist(), strict=True))
+    asset = assemble(photos, mesh, maps, parts, doubts)
+    if len(parts.get("vague", ())):
+        parts = parts | {"poses": turns_stage(asset, mesh, shown, camera, parts, run, seed)}
+        asset = assemble(photos, mesh, maps, parts, doubts)
     return ground_as_shown(asset, shots[0][0], seed)
 
 
@@ -152,6 +159,26 @@ def shown_faces(pile: Mesh, which: np.ndarray, cameras: list[Camera]) -> np.ndar
     seen = seen_faces(pile, cameras, ASLANT)
     instances = (pile.uvs[pile.faces[:, 0], 0] > NO_TEXELS).sum()
     return seen[:instances].reshape(len(which), -1)[which].any(0)
+
+
+def turns_stage(asset: Asset, mesh: Mesh, views: list[View], camera: Camera, parts, run, seed: int) -> np.ndarray:
+    """Poses (K, 4, 4) of all instances as in `parts`, with those that were turned by guess as the photo shows them."""
+    if run.done("turns"):
+        return run_arrays(run, "turns", "turns")["poses"]
+    poses, keys = parts["poses"].copy(), parts["keys"].tolist()
+    with run.stage("turns", title="turns about the axis") as stage:
+        axis, guessed = body_axis(mesh), [v for v in views if v.key in parts["vague"] and v.key in keys]
+        if axis is not None and guessed:
+            own = [keys.index(v.key) for v in guessed]
+            cameras = [v.camera.with_pose(camera.world_from_camera @ parts["motions"][v.photo]) for v in guessed]
+            before = poses[own] @ camera.camera_from_world
+            after = turned_as_shown(asset, guessed, cameras, before, axis, seed, run.progress("turns about the axis"))
+            for view, a, b in zip(guessed, before, after, strict=True):
+                turn = rotation_angle(a[:3, :3].T @ b[:3, :3])
+                run.say(f"the object with {named(view)}, rendered, differs least from the photo when it is turned by {turn:.0f} degrees")
+            poses[own] = after @ camera.world_from_camera
+        stage.save("turns", poses=poses)
+    return poses
 
 
 # ---------------------------------------------------------------- asset

@@ -1,0 +1,92 @@
+"""The turns about the axis of the object that were guessed, as the photo shows them: shape, material and light are known by then.
+
+What is placed on its axis by its outline alone (fit/turn_guess.py) is turned by how much its picture looks like the others'. Under one
+light they hardly do: gloss and shading stand still while the paint turns. Rendered, every turn shows what it would look like, gloss and
+all; the one that differs least from the photo is taken. Such an instance takes no part in shape and paint, before and after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from relit.conventions import srgb_from_linear
+from relit.fit.instances import View
+from relit.fit.turn_guess import turned_by
+from relit.geometry.revolution_axis import Axis
+from relit.rendering.mitsuba_scene import Scene, render
+from relit.rendering.photographed import lit_scene
+from relit.scene import Asset, Camera
+
+TURNS, HALVINGS = 24, 3  # about the axis; and how often half the way to the next one is tried on both sides
+SIDE, SAMPLES = 128, 16  # pixels of the pictures that are compared, longer side; rays a pixel
+SOLID = 0.98  # of a pixel that must be the instance's
+
+
+def turned_as_shown(
+    asset: Asset,
+    views: list[View],
+    cameras: list[Camera],
+    poses: np.ndarray,
+    axis: Axis,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda steps: None,
+) -> np.ndarray:
+    """The poses (V, 4, 4), object_from_world, each turned about the axis until the view, rendered, differs least from its photo.
+
+    asset: with all instances; those of the views stand at `poses` in it. views: of instances that were turned by guess. cameras: theirs,
+    in the world. axis: in the object's frame of the poses. progress: told how many scenes were rendered.
+    """
+    photos = [compared(v) for v in views]
+    count = 0
+
+    def differences(angles: np.ndarray) -> np.ndarray:
+        nonlocal count
+        turned = [turned_by(p, axis, a) for p, a in zip(poses, angles, strict=True)]
+        moves = {v.key: np.linalg.inv(t) @ p for v, t, p in zip(views, turned, poses, strict=True)}
+        scene = lit_scene(moved(asset, moves))
+        count += 1
+        progress(count)
+        return np.array([difference(scene, c, *photo, seed) for c, photo in zip(cameras, photos, strict=True)])
+
+    grid = 2 * np.pi / TURNS * np.arange(TURNS)
+    found = np.array([differences(np.full(len(views), a)) for a in grid])
+    best, least, step = grid[found.argmin(0)], found.min(0), grid[1]
+    for _ in range(HALVINGS):
+        step /= 2
+        before = best
+        for side in (-step, step):
+            tried = differences(before + side)
+            best, least = np.where(tried < least, before + side, best), np.minimum(tried, least)
+    return np.array([turned_by(p, axis, a) for p, a in zip(poses, best, strict=True)])
+
+
+def compared(view: View) -> tuple[np.ndarray, np.ndarray]:
+    """A view's photo, shrunk to SIDE and as displays show it (h, w, 3), and which of its pixels are all the instance's (h, w) bool."""
+    w, h = shrunk_size(view.camera)
+    photo = cv2.resize(view.rgb, (w, h), interpolation=cv2.INTER_AREA)
+    solid = cv2.resize((view.mask * view.known).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > SOLID
+    return srgb_from_linear(np.clip(photo, 0, 1)), solid
+
+
+def shrunk_size(camera: Camera) -> tuple[int, int]:
+    """Width and height of the pictures that are compared."""
+    factor = min(1.0, SIDE / max(camera.width, camera.height))
+    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+
+
+def difference(scene: Scene, camera: Camera, photo: np.ndarray, solid: np.ndarray, seed: int) -> float:
+    """Mean squared difference of what a camera sees from its photo, see `compared`; 0 where nothing is seen whole."""
+    if not solid.any():
+        return 0.0
+    picture = render(scene, camera.resized(*shrunk_size(camera)), spp=SAMPLES, seed=seed)
+    return float(((srgb_from_linear(np.clip(picture[..., :3], 0, 1)) - photo)[solid] ** 2).mean())
+
+
+def moved(asset: Asset, moves: dict[int, np.ndarray]) -> Asset:
+    """The asset with some instances, by label, moved by (4, 4) in the world."""
+    stand = [i if i.label not in moves else replace(i, world_from_object=moves[i.label] @ i.world_from_object) for i in asset.instances]
+    return replace(asset, instances=tuple(stand))
