@@ -8,11 +8,13 @@ from test_turn_guess import AXIS, vase
 
 from relit.cameras.se3 import look_at, rotation_angle
 from relit.conventions import similarity
+from relit.fit import duplicates
 from relit.fit import turns_as_shown as module
 from relit.fit.instances import View
 from relit.fit.turn_guess import turned_by
 from relit.fit.turns_as_shown import turned_as_shown
 from relit.rendering.photographed import as_photographed
+from relit.run import Run
 from relit.scene import Asset, Camera, Instance, Material
 
 SIZE = 96
@@ -50,6 +52,26 @@ def test_the_turn_that_looks_like_the_photo_is_found(photographed, angle):
     assert np.allclose(found[0] @ np.array([0, 0.2, 0.1, 1]), pose @ np.array([0, 0.2, 0.1, 1]), atol=1e-6)  # the axis stays where it is
     assert seen == list(range(1, module.TURNS + 2 * module.HALVINGS + 1))
     assert begun.instances[0].world_from_object is asset.instances[0].world_from_object
+
+
+def test_only_guessed_instances_are_turned_and_a_rerun_reads_them_back(photographed, tmp_path, monkeypatch):
+    asset, camera, view, pose = photographed
+    guess = turned_by(pose, AXIS, 2.5)
+    begun = module.moved(asset, {7: np.linalg.inv(guess) @ pose})
+    other = np.linalg.inv(asset.instances[0].world_from_object)
+    parts = {
+        "poses": np.array([other, guess]) @ camera.world_from_camera,
+        "keys": np.array([3, 7]),
+        "vague": np.array([7]),
+        "motions": np.eye(4)[None],
+    }
+    views = [replace(view, label=3), view]
+    with Run.open(tmp_path / "run", {}) as run:
+        poses = duplicates.turns_stage(begun, asset.mesh, views, camera, parts, run, 0)
+        assert np.array_equal(poses[0], parts["poses"][0])
+        assert rotation_angle(poses[1][:3, :3] @ (pose @ camera.world_from_camera)[:3, :3].T) < 3.0
+        monkeypatch.setattr(duplicates, "turned_as_shown", None)
+        assert np.array_equal(duplicates.turns_stage(begun, asset.mesh, views, camera, parts, run, 0), poses)
 
 
 def test_what_shows_nothing_whole_stays_as_it_is(photographed):
