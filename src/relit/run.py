@@ -96,9 +96,9 @@ class Run:
         """One log line, on stderr and in log.txt."""
         self.log.say(text)
 
-    def progress(self, title: str) -> Callable[[int], None]:
-        """A progress line for steps besides those of a stage: call it with how many are over."""
-        return Progress(self.log, title, None).update
+    def progress(self, title: str, steps: int | None = None) -> Callable[[int], None]:
+        """A progress line for steps besides those of a stage: call it with how many are over. steps: how many there will be, or None."""
+        return Progress(self.log, title, steps).update
 
     def done(self, stage: str) -> bool:
         """Did this stage run to its end, now or in an earlier process?"""

@@ -34,7 +34,7 @@ from relit.fit.instances import ANOTHER_PHOTO, View
 from relit.fit.lit_pile import lit_pile, surface_options
 from relit.fit.pile_scene import ground_colour, ground_reflectance, light_below
 from relit.fit.surface import ALBEDO_START, fit_surface, start_surface
-from relit.fit.turns_as_shown import turned_as_shown
+from relit.fit.turns_as_shown import SCENES, turned_as_shown
 from relit.fit.unseen import seen_faces
 from relit.fit.unseen_paint import painted_over
 from relit.fit.vessels import body_axis
@@ -172,7 +172,7 @@ def turns_stage(asset: Asset, mesh: Mesh, views: list[View], camera: Camera, par
             own = [keys.index(v.key) for v in guessed]
             cameras = [v.camera.with_pose(camera.world_from_camera @ parts["motions"][v.photo]) for v in guessed]
             before = poses[own] @ camera.camera_from_world
-            after = turned_as_shown(asset, guessed, cameras, before, axis, seed, run.progress("turns about the axis"))
+            after = turned_as_shown(asset, guessed, cameras, before, axis, seed, run.progress("turns about the axis", SCENES))
             for view, a, b in zip(guessed, before, after, strict=True):
                 turn = rotation_angle(a[:3, :3].T @ b[:3, :3])
                 run.say(f"the object with {named(view)}, rendered, differs least from the photo when it is turned by {turn:.0f} degrees")

@@ -23,6 +23,7 @@ from relit.scene import Asset, Camera
 
 TURNS, PLACES = 24, 3  # about the axis; of these the best ones that their neighbours do not beat are looked into
 HALVINGS = 2  # how often half the way to the next turn is tried on both sides
+SCENES = TURNS + 2 * HALVINGS * PLACES  # that are rendered
 SIDE, SAMPLES = 128, 8  # pixels of the pictures that are compared, longer side; rays a pixel of each of two pictures
 SOLID = 0.98  # of a pixel that must be the instance's
 
@@ -39,7 +40,7 @@ def turned_as_shown(
     """The poses (V, 4, 4), object_from_world, each turned about the axis until the view, rendered, differs least from its photo.
 
     asset: with all instances; those of the views stand at `poses` in it. views: of instances that were turned by guess. cameras: theirs,
-    in the world. axis: in the object's frame of the poses. progress: told how many scenes were rendered.
+    in the world. axis: in the object's frame of the poses. progress: told how many of SCENES were rendered.
     """
     photos = [compared(v) for v in views]
     count = 0
