@@ -58,7 +58,7 @@ def turned_as_shown(
     found = np.array([differences(np.full(len(views), a)) for a in grid])
     hollow = (found <= np.roll(found, 1, 0)) & (found <= np.roll(found, -1, 0))
     order = np.argsort(np.where(hollow, found, np.inf), axis=0)  # a window seen a little aslant can be worse than another one seen right
-    best, least = grid[order[0]], found.min(0)
+    best, least = grid[found.argmin(0)], found.min(0)
     for place in order[:PLACES]:
         angle, value, step = grid[place], np.take_along_axis(found, place[None], 0)[0], grid[1]
         for _ in range(HALVINGS):
