@@ -45,6 +45,11 @@ class Camera:
     def with_pose(self, world_from_camera: np.ndarray) -> Camera:
         return replace(self, world_from_camera=np.asarray(world_from_camera, dtype=np.float64))
 
+    def within(self, side: int) -> Camera:
+        """`resized` so that no side is longer than `side` pixels; the same size where none is."""
+        factor = min(1.0, side / max(self.width, self.height))
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image resampled to width x height pixels."""
         sx, sy = width / self.width, height / self.height

@@ -217,8 +217,7 @@ def photo_figure(asset: Asset, capture: Path, *, run: Path | None = None, spp: i
         raise UserError("the capture is no photo of duplicates", fix=f"give the folder that the run was made from: {capture}")
     camera = asset.cameras[0][1]
     own = np.isin(pixels.labels, [i.label for i in asset.instances if i.registered])
-    factor = min(1.0, PHOTO_SIDE / max(camera.width, camera.height))
-    camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    camera = camera.within(PHOTO_SIDE)
     rgb, where = shrunk(pixels.rgb, camera), shrunk(own.astype(np.float32), camera) >= m.MASK
     picture = as_photographed(asset)(asset.cameras[0][0], camera, spp=spp, seed=seed)
     return m.psnr(m.encode(picture[..., :3]), m.encode(rgb), where)

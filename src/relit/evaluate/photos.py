@@ -105,8 +105,7 @@ def photo_figures(show, asset: Asset, photo: Photo, sphere: Sphere | None, spp: 
     """Figures of one photo, without prefix: the masked ones where its mask is known, else those of the object sphere. show: see
     `rendering.photographed.as_photographed`."""
     pixels, camera = photo.load(), photo.camera
-    factor = min(1.0, SIDE / max(camera.width, camera.height))
-    camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    camera = camera.within(SIDE)
     rgb, mask = (shrunk(a, camera) for a in (pixels.rgb, pixels.mask))
     shown = show(photo.name, camera, spp=spp, seed=seed)
     alpha = shown[..., 3]

@@ -47,5 +47,4 @@ def glb_roundtrip(asset: Asset, folder: str | Path) -> float | None:
 
 
 def _small(camera: Camera) -> Camera:
-    factor = min(1.0, ROUNDTRIP_SIDE / max(camera.width, camera.height))
-    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    return camera.within(ROUNDTRIP_SIDE)

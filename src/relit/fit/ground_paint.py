@@ -23,8 +23,7 @@ def ground_as_shown(asset: Asset, pixels: Pixels, seed: int = 0) -> Asset:
     if asset.ground is None or pixels.labels is None:
         return asset
     name, camera = asset.cameras[0]
-    factor = min(1.0, SIDE / max(camera.width, camera.height))
-    camera = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    camera = camera.within(SIDE)
     size = (camera.width, camera.height)
     photo = cv2.resize(pixels.rgb, size, interpolation=cv2.INTER_AREA)
     free = cv2.resize((pixels.labels == 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999

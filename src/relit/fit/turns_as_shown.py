@@ -72,16 +72,11 @@ def turned_as_shown(
 
 def compared(view: View) -> tuple[np.ndarray, np.ndarray]:
     """A view's photo, shrunk to SIDE and as displays show it (h, w, 3), and which of its pixels are all the instance's (h, w) bool."""
-    w, h = shrunk_size(view.camera)
-    photo = cv2.resize(view.rgb, (w, h), interpolation=cv2.INTER_AREA)
-    solid = cv2.resize((view.mask * view.known).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > SOLID
+    small = view.camera.within(SIDE)
+    size = small.width, small.height
+    photo = cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA)
+    solid = cv2.resize((view.mask * view.known).astype(np.float32), size, interpolation=cv2.INTER_AREA) > SOLID
     return srgb_from_linear(np.clip(photo, 0, 1)), solid
-
-
-def shrunk_size(camera: Camera) -> tuple[int, int]:
-    """Width and height of the pictures that are compared."""
-    factor = min(1.0, SIDE / max(camera.width, camera.height))
-    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
 
 
 def difference(scene: Scene, camera: Camera, photo: np.ndarray, solid: np.ndarray, seed: int) -> float:
@@ -89,7 +84,7 @@ def difference(scene: Scene, camera: Camera, photo: np.ndarray, solid: np.ndarra
     pictures with samples of their own differ: the square of one would prefer what has less noise."""
     if not solid.any():
         return 0.0
-    small = camera.resized(*shrunk_size(camera))
+    small = camera.within(SIDE)
     pictures = [render(scene, small, spp=SAMPLES, seed=2 * seed + k)[..., :3] for k in (0, 1)]
     one, other = ((srgb_from_linear(np.clip(p, 0, 1)) - photo)[solid] for p in pictures)
     return float((one * other).mean())
