@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import trimesh
-from scipy.ndimage import binary_dilation, binary_propagation, minimum_filter
+from scipy.ndimage import binary_dilation, binary_propagation, grey_opening
 
 from relit.fit.hollows import small_pixels, small_size
 from relit.fit.instances import View
@@ -62,7 +62,8 @@ def lowest_cut(values: np.ndarray, heights: np.ndarray, views: list[View], camer
         lowest = np.full((h, w), np.inf)  # of what covers the pixel
         np.minimum.at(lowest, (rows, columns), height[seen])
         area = cv2.resize((view.mask * view.known).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
-        found.append(np.stack([minimum_filter(lowest, 3), area], -1).reshape(-1, 2))
+        closed = grey_opening(lowest, 3)  # nodes leave holes between their pixels
+        found.append(np.stack([closed, area], -1).reshape(-1, 2))
     lowest, area = np.concatenate(found).T
     order = np.argsort(lowest)
     order = order[np.isfinite(lowest[order])]

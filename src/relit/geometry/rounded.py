@@ -1,0 +1,104 @@
+"""A mesh that is nearly a body of revolution, made one where it is nearly that.
+
+Few photos tell the height of every bump, and what a pass makes of gloss that it does not explain is ripples: small in distances, but by
+their normals a metal mirrors other things. A body of revolution says the same place of its profile many times, once for every turn. So all
+vertices are looked at in the half plane of the axis, and each is moved along its normal there onto the curve that most of those near it lie
+on: robust moving least squares (Fleishman et al. 2005, "Robust moving least-squares fitting with sharp features", for surfaces). What stands
+out of that curve, handles and windows, or is not all around, stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from relit.geometry.revolution_axis import Axis
+from relit.geometry.tangents import vertex_normals
+from relit.scene import Mesh
+
+ROUNDS = 2
+WIDE, NEAR, FARTHEST = 2.0, 0.8, 1.5  # steps of the grid: along the profile; what lies as far beside it counts little; and is not moved so far
+FITS = 6  # of each parabola, the first two with twice NEAR
+TURNS = 24  # bins about the axis
+AROUND = 0.4, 0.65  # share of the bins that show the curve, below which a vertex stays and from which on it is moved
+ON_IT = 0.5, 0.7  # the same of what lies near along the profile, by area
+ALONG = 0.9, 0.98  # the same of the length of a normal that lies in the half plane: others are of no profile
+FLAT = np.array([0.0, 1e-3, 1e-2])  # of a parabola's slope and bend, what is not told otherwise
+AT_ONCE, CLOUD = 2000, 4000  # vertices that are moved at once; that tell the curves, at most
+
+
+def rounded(mesh: Mesh, axis: Axis, step: float) -> Mesh:
+    """The mesh, its vertices moved by less than FARTHEST steps, and its normals as they are then. step: of the grid that the mesh was
+    extracted from, in its units."""
+    for _ in range(ROUNDS):
+        move = along_profile(mesh, axis, step)
+        moved = replace(mesh, vertices=(mesh.vertices + move).astype(np.float32))
+        mesh = replace(moved, normals=vertex_normals(moved))
+    return mesh
+
+
+def along_profile(mesh: Mesh, axis: Axis, step: float) -> np.ndarray:
+    """(V, 3) the moves of the vertices in one round of `rounded`."""
+    place, normal, in_plane, turn, away = half_plane(mesh, axis)
+    weight = vertex_areas(mesh) / np.maximum(place[:, 0], WIDE * step) * ramp(in_plane, ALONG)  # so every turn counts the same
+    cloud = np.random.default_rng(0).permutation(len(place))[:CLOUD]
+    tree, chunks = cKDTree(place[cloud]), np.array_split(np.arange(len(place)), max(1, len(place) // AT_ONCE))
+    found = [towards_curve(tree, cloud, place, normal, weight, turn, some, step) for some in chunks]
+    shift = np.concatenate(found) * ramp(in_plane, ALONG)
+    return shift[:, None] * (normal[:, :1] * away + normal[:, 1:] * axis.direction)
+
+
+def half_plane(mesh: Mesh, axis: Axis):
+    """(place (V, 2) radius and height, normal (V, 2) unit in the half plane, in_plane (V,) length of the normal's part there, turn (V,) bin
+    about the axis, away (V, 3) unit from the axis)."""
+    from_axis = np.asarray(mesh.vertices, np.float64) - axis.point
+    height = from_axis @ axis.direction
+    away = from_axis - height[:, None] * axis.direction
+    radius = np.linalg.norm(away, axis=1)
+    away /= np.maximum(radius, 1e-9)[:, None]
+    n = np.asarray(vertex_normals(mesh), np.float64)
+    normal = np.stack([(n * away).sum(1), n @ axis.direction], 1)
+    in_plane = np.linalg.norm(normal, axis=1)
+    across = np.linalg.svd(axis.direction[None])[2][1:]
+    turn = np.floor((np.arctan2(away @ across[0], away @ across[1]) / (2 * np.pi) + 0.5) * TURNS).astype(int) % TURNS
+    return np.stack([radius, height], 1), normal / np.maximum(in_plane, 1e-9)[:, None], in_plane, turn, away
+
+
+def towards_curve(tree: cKDTree, cloud, place, normal, weight, turn, some: np.ndarray, step: float) -> np.ndarray:
+    """(len(some),) by how much these vertices are moved along their normals in the half plane. tree: of the places of the vertices `cloud`.
+    Others as `half_plane` has them."""
+    near = tree.query_ball_point(place[some], 2.5 * WIDE * step)
+    of, j = np.repeat(np.arange(len(some)), [len(n) for n in near]), cloud[np.concatenate([np.asarray(n, int) for n in near])]
+    n, d = normal[some][of], place[j] - place[some][of]
+    off = (d * n).sum(1)
+    s = (n[:, 0] * d[:, 1] - n[:, 1] * d[:, 0]) / (WIDE * step)
+    alike = weight[j] * np.exp(-(s**2) / 2) * np.maximum((normal[j] * n).sum(1), 0) ** 4
+    terms, curve = np.stack([np.ones_like(s), s, s**2], 1), np.zeros((len(some), 3))
+    total = np.maximum(np.bincount(of, alike, len(some)), 1e-12)
+    for k in range(FITS):
+        left = off - (terms * curve[of]).sum(1)
+        w = alike / total[of] * np.exp(-((left / (NEAR * step * (2 if k < 2 else 1))) ** 2) / 2)
+        normal_matrix = np.stack([np.bincount(of, w * terms[:, a] * terms[:, b], len(some)) for a in range(3) for b in range(3)], -1)
+        asked = np.stack([np.bincount(of, w * terms[:, a] * off, len(some)) for a in range(3)], -1)
+        held = normal_matrix[:, :1, None] * np.diag(FLAT) + 1e-9 * np.eye(3)
+        curve = np.linalg.solve(normal_matrix.reshape(-1, 3, 3) + held, asked[..., None])[..., 0]
+    on_it = np.abs(off - (terms * curve[of]).sum(1)) < 2 * NEAR * step
+    share = np.bincount(of, alike * on_it, len(some)) / total
+    each, all_ = (np.bincount(of * TURNS + turn[j], alike * w, len(some) * TURNS).reshape(-1, TURNS) for w in (on_it, 1.0))
+    around = ((each > 0.3 * all_) & (all_ > 0)).mean(1)
+    shift = curve[:, 0]
+    return shift * ramp(share, ON_IT) * ramp(around, AROUND) * ramp(-np.abs(shift) / (FARTHEST * step), (-1.0, -0.7))
+
+
+def ramp(x: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
+    """0 below the first end, 1 from the second on, even in between."""
+    return np.clip((x - ends[0]) / (ends[1] - ends[0]), 0, 1)
+
+
+def vertex_areas(mesh: Mesh) -> np.ndarray:
+    """(V,) a third of the faces about each vertex."""
+    a, b, c = np.moveaxis(np.asarray(mesh.vertices, np.float64)[mesh.faces], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    return np.bincount(mesh.faces.ravel(), np.repeat(area, 3), len(mesh.vertices))
