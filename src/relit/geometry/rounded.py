@@ -1,10 +1,10 @@
 """A mesh that is nearly a body of revolution, made one where it is nearly that.
 
 Few photos tell the height of every bump, and what a pass makes of gloss that it does not explain is ripples: small in distances, but by
-their normals a metal mirrors other things. A body of revolution says the same place of its profile many times, once for every turn. So all
-vertices are looked at in the half plane of the axis, and each is moved along its normal there onto the curve that most of those near it lie
-on: robust moving least squares (Fleishman et al. 2005, "Robust moving least-squares fitting with sharp features", for surfaces). What stands
-out of that curve, handles and windows, or is not all around, stays.
+their normals a metal mirrors other things. A body of revolution says the same place of its profile many times, once for every turn. So
+all vertices are looked at in the half plane of the axis, and each is moved along its normal there onto the curve that most of those near
+it lie on: robust moving least squares (Fleishman et al. 2005, "Robust moving least-squares fitting with sharp features", for surfaces).
+What stands out of that curve, handles and windows, or is not all around, stays.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from relit.geometry.tangents import vertex_normals
 from relit.scene import Mesh
 
 ROUNDS = 2
-WIDE, NEAR, FARTHEST = 2.0, 0.8, 1.5  # steps of the grid: along the profile; what lies as far beside it counts little; and is not moved so far
+WIDE = 2.0  # steps of the grid, along the profile
+NEAR, FARTHEST = 0.8, 1.5  # steps beside it: what lies so far counts little; no vertex is moved so far
 FITS = 6  # of each parabola, the first two with twice NEAR
 TURNS = 24  # bins about the axis
 AROUND = 0.4, 0.65  # share of the bins that show the curve, below which a vertex stays and from which on it is moved
-ON_IT = 0.5, 0.7  # the same of what lies near along the profile, by area
+ON_IT = 0.75, 0.9  # the same of what lies near along the profile, by area
 ALONG = 0.9, 0.98  # the same of the length of a normal that lies in the half plane: others are of no profile
 FLAT = np.array([0.0, 1e-3, 1e-2])  # of a parabola's slope and bend, what is not told otherwise
 AT_ONCE, CLOUD = 2000, 4000  # vertices that are moved at once; that tell the curves, at most
