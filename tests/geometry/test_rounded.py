@@ -10,7 +10,7 @@ from relit.geometry.revolution_axis import Axis
 from relit.geometry.rounded import rounded
 from relit.geometry.sdf import node_positions, redistance
 
-N = 96
+N = 64
 STEP = 2 / (N - 1)
 AXIS = Axis(np.array([0.02, 0, -0.01]), np.array([0.1, 0.99, 0.05]) / np.linalg.norm([0.1, 0.99, 0.05]))
 
@@ -51,9 +51,9 @@ def test_a_handle_stays():
     place = AXIS.point + 0.5 * away / np.linalg.norm(away)
     mesh = lathe(extra=lambda p: np.linalg.norm(p - place, axis=-1) - 0.2)
     ball = np.linalg.norm(mesh.vertices - place, axis=1) < 0.21
-    ball &= AXIS.radii(mesh.vertices) > 0.42 + 2 * STEP
+    ball &= AXIS.radii(mesh.vertices) > 0.42 + 4 * STEP  # away from where it meets the body
     moved = np.linalg.norm(rounded(mesh, AXIS, STEP).vertices - mesh.vertices, axis=1)
-    assert ball.sum() > 200 and np.quantile(moved[ball], 0.97) < 0.1 * STEP and moved[ball].max() < 0.5 * STEP  # where it meets the body
+    assert ball.sum() > 200 and moved[ball].max() < 0.3 * STEP and np.median(moved[ball]) == 0
 
 
 def test_a_window_stays():
@@ -72,6 +72,6 @@ def test_a_window_stays():
 
 
 def test_an_oval_stays():
-    mesh = lathe(lambda turn, height: 0.05 * np.cos(2 * turn))
+    mesh = lathe(lambda turn, height: 0.1 * np.cos(2 * turn))
     before, after = off(mesh)[0], off(rounded(mesh, AXIS, STEP))[0]
     assert after.std() > 0.95 * before.std()

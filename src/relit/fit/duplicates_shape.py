@@ -32,6 +32,7 @@ from relit.fit.pose_passes import (
     related,
     shape_and_poses,
 )
+from relit.fit.round_bodies import placed_round
 from relit.fit.sought_again import sought_again
 from relit.fit.turn_guess import others_of, turned_alike
 from relit.fit.vessel_trial import vessel_of
@@ -39,7 +40,6 @@ from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel
 from relit.geometry.atlas import unwrap
 from relit.geometry.mesh import extract_mesh
-from relit.geometry.rounded import rounded
 from relit.geometry.sdf import dense_values, redistance, resample, row_features
 from relit.rendering.shade_world import instance_radiance
 from relit.run import run_arrays
@@ -68,7 +68,9 @@ def shape_stages(
         mesh = extract_mesh(values, faces=options.faces)
         if follow is not None:
             mesh, poses, _ = follow(mesh, views, poses, run, options)
-        mesh = made_round(mesh, options)
+        even = placed_round(mesh, views, poses, run, options) if rate > 0 else None
+        if even is not None:
+            mesh, poses = even
         if vague:
             there, turned = [v for v, _ in vague], np.array([p for _, p in vague])
             if follow is not None:
@@ -106,12 +108,6 @@ def shape_stages(
         }
         stage.save("mesh", **parts)
     return parts
-
-
-def made_round(mesh: Mesh, options: DuplicatesOptions) -> Mesh:
-    """The mesh, made a body of revolution where it nearly is one; others as they are."""
-    axis = None if "rounding" in options.without else body_axis(mesh)
-    return mesh if axis is None else rounded(mesh, axis, 2 / (options.levels[-1] - 1))
 
 
 def parts_of(mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndarray]) -> dict[str, np.ndarray]:
