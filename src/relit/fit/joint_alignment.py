@@ -102,19 +102,17 @@ def by_textures(mesh: Mesh, placed: list[Camera], pictures, masks) -> list[Camer
     return placed
 
 
-def by_both(
-    mesh: Mesh, placed: list[Camera], pictures, masks, known, rounds: int, softer: tuple[float, float] | None = None, told: float = 0.0
-):
+def by_both(mesh: Mesh, placed: list[Camera], pictures, masks, known, rounds: int, softer: tuple[float, float] | None = None):
     """(mesh, cameras) after at most so many rounds in which outlines and textures move both. softer: in the place of STIFF and REST;
-    outlines then count however far they are off. told: where it is given the mesh stays, see `texture_rows`."""
+    outlines then count however far they are off."""
     spread = 0.0
     for _ in range(rounds):
         shifts, before = texture_shifts(mesh, placed, pictures, masks), placed
         if not shifts:
             break
-        rows = texture_rows(shifts, placed, told)
+        rows = texture_rows(shifts, placed)
         outlines, spread = outline_rows(mesh, placed, masks, known, max(spread, LABELS) if softer else 0.0)
-        mesh, placed = solved(mesh, placed, rows + outlines, told > 0, softer or (STIFF, REST))
+        mesh, placed = solved(mesh, placed, rows + outlines, stiffness=softer or (STIFF, REST))
         if settled(before, placed):
             break
     return mesh, placed
@@ -149,9 +147,8 @@ def tangents(normals: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normals, first)], -1)
 
 
-def texture_rows(shifts: list[Shifts], cameras: list[Camera], told: float = 0.0) -> list[Rows]:
-    """Two equations for each place, x and y. told: how far the surface may lie beside the mesh along its normals where the mesh stays: seen
-    aslant, it moves in the picture by that too."""
+def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
+    """Two equations for each place, x and y."""
     spread = max(1.48 * misfit(shifts) / 1.18, FAINTEST)  # of one coordinate: the median length is 1.18 deviations
     out = []
     for s, share in zip(shifts, shares(shifts), strict=True):
@@ -160,9 +157,8 @@ def texture_rows(shifts: list[Shifts], cameras: list[Camera], told: float = 0.0)
         t = tangents(s.normal)
         m = (here @ t) @ np.linalg.pinv(there @ t)
         along = ((here - m @ there) @ s.normal[..., None])[..., 0]
-        each = np.hypot(spread, told * np.linalg.norm(along, axis=1))
-        far = np.linalg.norm(s.shift, axis=1) / (OUTLIER * each)
-        trust = (np.linalg.norm(m, axis=(1, 2)) < SLANTED) * share / (each * (1 + far**2)) ** 2
+        far = np.linalg.norm(s.shift, axis=1) / (OUTLIER * spread)
+        trust = (np.linalg.norm(m, axis=(1, 2)) < SLANTED) * share / (spread * (1 + far**2)) ** 2
         views = np.full(len(far), s.view), np.full(len(far), s.other)
         for axis in (0, 1):
             poses = [(views[0], turn_here[:, axis]), (views[1], -(m @ turn_there)[:, axis])]

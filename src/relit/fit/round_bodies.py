@@ -2,8 +2,7 @@
 
 What a pass builds from poses that are half a degree off is a body that every outline is right for, and whose bumps make up for what the
 poses are wrong by. Made round (`geometry.rounded`), it cannot, and outlines tell the axes and the distances of all instances: bottle,
-N = 10, axes from .38 to .07 degree, distances from .3 to .05 per cent (medians). Turns about the axis are for textures to tell, and
-what is seen aslant tells them wrongly, as the body is right to a step of its grid only; counted so, they come from .6 to .3 degree.
+N = 10, axes from .38 to .07 degree, distances from .3 to .05 per cent (medians). They leave the turns about the axis as textures have them.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import numpy as np
 
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.instances import View
-from relit.fit.joint_alignment import BOTH, by_both
 from relit.fit.outlines import follow_with_poses, outline_misfit
 from relit.fit.vessels import body_axis
 from relit.geometry.rounded import rounded
@@ -29,15 +27,11 @@ def placed_round(mesh: Mesh, views: list[View], poses: np.ndarray, run, options:
         return None
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
     masks, known = zip(*((v.mask, v.known) for v in views), strict=True)
-    step = 2 / (options.levels[-1] - 1)
-    even = rounded(mesh, axis, step)
+    even = rounded(mesh, axis, 2 / (options.levels[-1] - 1))
     before, at_once = (outline_misfit(one, cameras, masks, known) for one in (mesh, even))
     if at_once > before + OVAL:
         return None
     placed = follow_with_poses(even, cameras, masks, known, options.outlines, still=True, held=axis.direction)[1]
-    cameras = [c.with_pose(p) for c, p in zip(cameras, placed, strict=True)]
-    if "textures" not in options.without:
-        _, cameras = by_both(even, cameras, [v.rgb for v in views], masks, known, BOTH, told=step)
-    after = outline_misfit(even, cameras, masks, known)
+    after = outline_misfit(even, [c.with_pose(p) for c, p in zip(cameras, placed, strict=True)], masks, known)
     run.say(f"a body of revolution: its bumps are smoothed all around (outlines {before:.2f}, {at_once:.2f}, then {after:.2f} pixels off)")
-    return even, np.array([c.world_from_camera for c in cameras])
+    return even, placed
