@@ -109,7 +109,8 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
             better, moved, off = followed(mesh, some, poses[~odd], run, options)
             if off is not None:
                 mesh, poses[~odd] = better, moved
-            even = placed_round(mesh, some, poses[~odd], run, options)
+            if off is None or off >= CLOSE:
+                even = placed_round(mesh, some, poses[~odd], run, options)
             if even is not None:
                 mesh, poses[~odd] = even
             if off is not None:
