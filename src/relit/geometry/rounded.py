@@ -18,7 +18,7 @@ from relit.geometry.revolution_axis import Axis
 from relit.geometry.tangents import vertex_normals
 from relit.scene import Mesh
 
-ROUNDS = 2
+CENTRED, ROUNDS = 3, 2  # steps of the axis, then of the vertices
 WIDE = 2.0  # steps of the grid, along the profile
 NEAR, FARTHEST = 0.8, 1.5  # steps beside it: what lies so far counts little; no vertex is moved so far
 FITS = 6  # of each parabola, the first two with twice NEAR
@@ -31,24 +31,41 @@ AT_ONCE, CLOUD = 2000, 4000  # vertices that are moved at once; that tell the cu
 
 
 def rounded(mesh: Mesh, axis: Axis, step: float) -> Mesh:
-    """The mesh, its vertices moved by less than FARTHEST steps, and its normals as they are then. step: of the grid that the mesh was
-    extracted from, in its units."""
+    """The mesh, its vertices moved by less than FARTHEST steps, and its normals as they are then. axis: nearly that of the body. step: of
+    the grid that the mesh was extracted from, in its units."""
+    for _ in range(CENTRED):
+        axis = centred(mesh, axis, step)
     for _ in range(ROUNDS):
-        move = along_profile(mesh, axis, step)
-        moved = replace(mesh, vertices=(mesh.vertices + move).astype(np.float32))
+        shift, normal, _ = along_profile(mesh, axis, step)
+        moved = replace(mesh, vertices=(mesh.vertices + shift[:, None] * normal).astype(np.float32))
         mesh = replace(moved, normals=vertex_normals(moved))
     return mesh
 
 
-def along_profile(mesh: Mesh, axis: Axis, step: float) -> np.ndarray:
-    """(V, 3) the moves of the vertices in one round of `rounded`."""
+def centred(mesh: Mesh, axis: Axis, step: float) -> Axis:
+    """The axis after one Gauss-Newton step: moved and leant so that least is left to move the vertices by, as whatever stands out on one
+    side pulls at the normals (`revolution_axis`). A body that is moved by a + ω x r against its axis asks for -n . (a + ω x r)."""
+    shift, normal, weight = along_profile(mesh, axis, step)
+    across = np.linalg.svd(axis.direction[None])[2][1:]  # along the axis and about it nothing is told
+    arm = np.cross(mesh.vertices - axis.point, normal)
+    rows = np.concatenate([normal @ across.T, arm @ across.T], 1)
+    normal_matrix = (rows * weight[:, None]).T @ rows
+    found = np.linalg.solve(normal_matrix + 1e-9 * np.trace(normal_matrix) * np.eye(4), -rows.T @ (weight * shift))
+    direction = axis.direction + np.cross(found[2:] @ across, axis.direction)
+    return Axis(axis.point + found[:2] @ across, direction / np.linalg.norm(direction))
+
+
+def along_profile(mesh: Mesh, axis: Axis, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(shift (V,) of the vertices along their normals in the half plane onto the curve, those (V, 3), weight (V,) by area, 0 for what
+    stays)."""
     place, normal, in_plane, turn, away = half_plane(mesh, axis)
-    weight = vertex_areas(mesh) / np.maximum(place[:, 0], WIDE * step) * ramp(in_plane, ALONG)  # so every turn counts the same
+    area = vertex_areas(mesh)
+    weight = area / np.maximum(place[:, 0], WIDE * step) * ramp(in_plane, ALONG)  # so every turn counts the same
     cloud = np.random.default_rng(0).permutation(len(place))[:CLOUD]
     tree, chunks = cKDTree(place[cloud]), np.array_split(np.arange(len(place)), max(1, len(place) // AT_ONCE))
-    found = [towards_curve(tree, cloud, place, normal, weight, turn, some, step) for some in chunks]
-    shift = np.concatenate(found) * ramp(in_plane, ALONG)
-    return shift[:, None] * (normal[:, :1] * away + normal[:, 1:] * axis.direction)
+    found = np.concatenate([towards_curve(tree, cloud, place, normal, weight, turn, some, step) for some in chunks])
+    part = found[:, 1] * ramp(in_plane, ALONG)
+    return found[:, 0] * part, normal[:, :1] * away + normal[:, 1:] * axis.direction, area * part
 
 
 def half_plane(mesh: Mesh, axis: Axis):
@@ -68,8 +85,8 @@ def half_plane(mesh: Mesh, axis: Axis):
 
 
 def towards_curve(tree: cKDTree, cloud, place, normal, weight, turn, some: np.ndarray, step: float) -> np.ndarray:
-    """(len(some),) by how much these vertices are moved along their normals in the half plane. tree: of the places of the vertices `cloud`.
-    Others as `half_plane` has them."""
+    """(len(some), 2) by how much these vertices lie beside the curve, along their normals in the half plane, and what part of it they are
+    moved by. tree: of the places of the vertices `cloud`. Others as `half_plane` has them."""
     near = tree.query_ball_point(place[some], 2.5 * WIDE * step)
     of, j = np.repeat(np.arange(len(some)), [len(n) for n in near]), cloud[np.concatenate([np.asarray(n, int) for n in near])]
     n, d = normal[some][of], place[j] - place[some][of]
@@ -90,7 +107,7 @@ def towards_curve(tree: cKDTree, cloud, place, normal, weight, turn, some: np.nd
     each, all_ = (np.bincount(of * TURNS + turn[j], alike * w, len(some) * TURNS).reshape(-1, TURNS) for w in (on_it, 1.0))
     around = ((each > 0.3 * all_) & (all_ > 0)).mean(1)
     shift = curve[:, 0]
-    return shift * ramp(share, ON_IT) * ramp(around, AROUND) * ramp(-np.abs(shift) / (FARTHEST * step), (-1.0, -0.7))
+    return np.stack([shift, ramp(share, ON_IT) * ramp(around, AROUND) * ramp(-np.abs(shift) / (FARTHEST * step), (-1.0, -0.7))], 1)
 
 
 def ramp(x: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
