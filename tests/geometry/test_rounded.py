@@ -7,7 +7,7 @@ import pytest
 
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.revolution_axis import Axis
-from relit.geometry.rounded import rounded
+from relit.geometry.rounded import centred, rounded
 from relit.geometry.sdf import node_positions, redistance
 
 N = 64
@@ -75,3 +75,17 @@ def test_an_oval_stays():
     mesh = lathe(lambda turn, height: 0.1 * np.cos(2 * turn))
     before, after = off(mesh)[0], off(rounded(mesh, AXIS, STEP))[0]
     assert after.std() > 0.95 * before.std()
+
+
+def test_an_axis_that_is_off_is_found():
+    lean = np.cross(AXIS.direction, [0, 0, 1.0]) * 0.02
+    wrong = Axis(AXIS.point + np.array([0.006, 0, 0.004]), (AXIS.direction + lean) / np.linalg.norm(AXIS.direction + lean))
+    mesh = lathe(lambda turn, height: 0.004 * np.sin(9 * turn + 7 * height))
+    found = wrong
+    for _ in range(3):
+        found = centred(mesh, found, STEP)
+    assert np.degrees(np.arccos(found.direction @ AXIS.direction)) < 0.1
+    between = found.point - AXIS.point
+    assert np.linalg.norm(between - between @ AXIS.direction * AXIS.direction) < 0.03 * STEP
+    (before, _), (after, _) = off(mesh), off(rounded(mesh, wrong, STEP))
+    assert after.std() < 0.3 * before.std()

@@ -19,9 +19,10 @@ from relit.geometry.tangents import vertex_normals
 from relit.scene import Mesh
 
 CENTRED, ROUNDS = 3, 2  # steps of the axis, then of the vertices
+SPARSE = 4  # of so many vertices one is asked about the axis
 WIDE = 2.0  # steps of the grid, along the profile
 NEAR, FARTHEST = 0.8, 1.5  # steps beside it: what lies so far counts little; no vertex is moved so far
-FITS = 6  # of each parabola, the first two with twice NEAR
+FITS = 5  # of each parabola, the first two with twice NEAR
 TURNS = 24  # bins about the axis
 AROUND = 0.4, 0.65  # share of the bins that show the curve, below which a vertex stays and from which on it is moved
 ON_IT = 0.75, 0.9  # the same of what lies near along the profile, by area
@@ -36,7 +37,7 @@ def rounded(mesh: Mesh, axis: Axis, step: float) -> Mesh:
     for _ in range(CENTRED):
         axis = centred(mesh, axis, step)
     for _ in range(ROUNDS):
-        shift, normal, _ = along_profile(mesh, axis, step)
+        shift, normal, *_ = along_profile(mesh, axis, step)
         moved = replace(mesh, vertices=(mesh.vertices + shift[:, None] * normal).astype(np.float32))
         mesh = replace(moved, normals=vertex_normals(moved))
     return mesh
@@ -45,9 +46,9 @@ def rounded(mesh: Mesh, axis: Axis, step: float) -> Mesh:
 def centred(mesh: Mesh, axis: Axis, step: float) -> Axis:
     """The axis after one Gauss-Newton step: moved and leant so that least is left to move the vertices by, as whatever stands out on one
     side pulls at the normals (`revolution_axis`). A body that is moved by a + ω x r against its axis asks for -n . (a + ω x r)."""
-    shift, normal, weight = along_profile(mesh, axis, step)
+    shift, normal, weight, some = along_profile(mesh, axis, step, SPARSE)
     across = np.linalg.svd(axis.direction[None])[2][1:]  # along the axis and about it nothing is told
-    arm = np.cross(mesh.vertices - axis.point, normal)
+    arm = np.cross(mesh.vertices[some] - axis.point, normal)
     rows = np.concatenate([normal @ across.T, arm @ across.T], 1)
     normal_matrix = (rows * weight[:, None]).T @ rows
     found = np.linalg.solve(normal_matrix + 1e-9 * np.trace(normal_matrix) * np.eye(4), -rows.T @ (weight * shift))
@@ -55,17 +56,18 @@ def centred(mesh: Mesh, axis: Axis, step: float) -> Axis:
     return Axis(axis.point + found[:2] @ across, direction / np.linalg.norm(direction))
 
 
-def along_profile(mesh: Mesh, axis: Axis, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(shift (V,) of the vertices along their normals in the half plane onto the curve, those (V, 3), weight (V,) by area, 0 for what
-    stays)."""
+def along_profile(mesh: Mesh, axis: Axis, step: float, every: int = 1):
+    """(shift (N,) of some vertices along their normals in the half plane onto the curve, those (N, 3), weight (N,) by area, 0 for what
+    stays; the vertices (N,)). every: one of so many is asked."""
     place, normal, in_plane, turn, away = half_plane(mesh, axis)
-    area = vertex_areas(mesh)
+    area, some = vertex_areas(mesh), np.arange(0, len(place), every)
     weight = area / np.maximum(place[:, 0], WIDE * step) * ramp(in_plane, ALONG)  # so every turn counts the same
     cloud = np.random.default_rng(0).permutation(len(place))[:CLOUD]
-    tree, chunks = cKDTree(place[cloud]), np.array_split(np.arange(len(place)), max(1, len(place) // AT_ONCE))
-    found = np.concatenate([towards_curve(tree, cloud, place, normal, weight, turn, some, step) for some in chunks])
-    part = found[:, 1] * ramp(in_plane, ALONG)
-    return found[:, 0] * part, normal[:, :1] * away + normal[:, 1:] * axis.direction, area * part
+    tree, chunks = cKDTree(place[cloud]), np.array_split(some, max(1, len(some) // AT_ONCE))
+    found = np.concatenate([towards_curve(tree, cloud, place, normal, weight, turn, chunk, step) for chunk in chunks])
+    part = found[:, 1] * ramp(in_plane[some], ALONG)
+    along = normal[some, :1] * away[some] + normal[some, 1:] * axis.direction
+    return found[:, 0] * part, along, area[some] * part, some
 
 
 def half_plane(mesh: Mesh, axis: Axis):
@@ -93,16 +95,16 @@ def towards_curve(tree: cKDTree, cloud, place, normal, weight, turn, some: np.nd
     off = (d * n).sum(1)
     s = (n[:, 0] * d[:, 1] - n[:, 1] * d[:, 0]) / (WIDE * step)
     alike = weight[j] * np.exp(-(s**2) / 2) * np.maximum((normal[j] * n).sum(1), 0) ** 4
-    terms, curve = np.stack([np.ones_like(s), s, s**2], 1), np.zeros((len(some), 3))
+    powers, curve = np.cumprod([np.ones_like(s), s, s, s, s], axis=0), np.zeros((len(some), 3))
     total = np.maximum(np.bincount(of, alike, len(some)), 1e-12)
     for k in range(FITS):
-        left = off - (terms * curve[of]).sum(1)
+        left = off - (powers[:3].T * curve[of]).sum(1)
         w = alike / total[of] * np.exp(-((left / (NEAR * step * (2 if k < 2 else 1))) ** 2) / 2)
-        normal_matrix = np.stack([np.bincount(of, w * terms[:, a] * terms[:, b], len(some)) for a in range(3) for b in range(3)], -1)
-        asked = np.stack([np.bincount(of, w * terms[:, a] * off, len(some)) for a in range(3)], -1)
-        held = normal_matrix[:, :1, None] * np.diag(FLAT) + 1e-9 * np.eye(3)
-        curve = np.linalg.solve(normal_matrix.reshape(-1, 3, 3) + held, asked[..., None])[..., 0]
-    on_it = np.abs(off - (terms * curve[of]).sum(1)) < 2 * NEAR * step
+        moment = np.stack([np.bincount(of, w * power, len(some)) for power in powers], -1)
+        asked = np.stack([np.bincount(of, w * off * power, len(some)) for power in powers[:3]], -1)
+        held = moment[:, :1, None] * np.diag(FLAT) + 1e-9 * np.eye(3)
+        curve = np.linalg.solve(moment[:, np.add.outer(np.arange(3), np.arange(3))] + held, asked[..., None])[..., 0]
+    on_it = np.abs(off - (powers[:3].T * curve[of]).sum(1)) < 2 * NEAR * step
     share = np.bincount(of, alike * on_it, len(some)) / total
     each, all_ = (np.bincount(of * TURNS + turn[j], alike * w, len(some) * TURNS).reshape(-1, TURNS) for w in (on_it, 1.0))
     around = ((each > 0.3 * all_) & (all_ > 0)).mean(1)
