@@ -32,7 +32,7 @@ from relit.fit.pose_passes import (
     related,
     shape_and_poses,
 )
-from relit.fit.round_bodies import made_round, placed_round
+from relit.fit.round_bodies import placed_round
 from relit.fit.sought_again import sought_again
 from relit.fit.turn_guess import others_of, turned_alike
 from relit.fit.vessel_trial import vessel_of
@@ -68,9 +68,7 @@ def shape_stages(
         mesh = extract_mesh(values, faces=options.faces)
         if follow is not None:
             mesh, poses, _ = follow(mesh, views, poses, run, options)
-        if follow is placed_by_outlines or rate == 0:
-            mesh = made_round(mesh, views, poses, run, options) or mesh
-        else:
+        if rate > 0 and follow is not placed_by_outlines:
             mesh, poses = placed_round(mesh, views, poses, run, options) or (mesh, poses)
         if vague:
             there, turned = [v for v, _ in vague], np.array([p for _, p in vague])

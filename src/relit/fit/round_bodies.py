@@ -19,30 +19,20 @@ from relit.scene import Mesh
 OVAL = 0.6  # pixels that outlines may move away from the labels by as a body is made round, its instances where they are: not an oval
 
 
-def made_round(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> Mesh | None:
-    """A body of revolution, made round; None of others, and of one that outlines say is oval. poses: (N, 4, 4)."""
+def placed_round(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray] | None:
+    """(mesh, poses (N, 4, 4)) of a body of revolution, made round, with its instances where outlines have them then; None of others, and of
+    one that outlines say is oval. For poses that textures do not tell better: where these lie on one another they do, and mesh and outlines
+    agree as they are."""
     axis = None if "rounding" in options.without else body_axis(mesh)
     if axis is None:
         return None
-    cameras, masks, known = seen_by(views, poses)
+    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+    masks, known = [v.mask for v in views], [v.known for v in views]
     even = rounded(mesh, axis, 2 / (options.levels[-1] - 1))
     before, after = (outline_misfit(one, cameras, masks, known) for one in (mesh, even))
     if after > before + OVAL:
         return None
-    run.say(f"a body of revolution: its bumps are smoothed all around (outlines were {before:.2f} pixels off, now {after:.2f})")
-    return even
-
-
-def placed_round(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray] | None:
-    """(mesh, poses (N, 4, 4)) of `made_round`, its instances where outlines have them then; None as there. For poses that textures do not
-    tell better: where these lie on one another they do, as the profile has errors of its own."""
-    even = made_round(mesh, views, poses, run, options)
-    if even is None:
-        return None
-    return even, follow_with_poses(even, *seen_by(views, poses), options.outlines, still=True, held=body_axis(mesh).direction)[1]
-
-
-def seen_by(views: list[View], poses: np.ndarray):
-    """Cameras at the poses, masks and what is known of them, for `fit.outlines`."""
-    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-    return cameras, [v.mask for v in views], [v.known for v in views]
+    placed = follow_with_poses(even, cameras, masks, known, options.outlines, still=True, held=axis.direction)[1]
+    there = outline_misfit(even, [c.with_pose(p) for c, p in zip(cameras, placed, strict=True)], masks, known)
+    run.say(f"a body of revolution: its bumps are smoothed all around (outlines {before:.2f}, {after:.2f}, then {there:.2f} pixels off)")
+    return even, placed
