@@ -17,13 +17,15 @@ from relit.geometry.rounded import rounded
 from relit.scene import Mesh
 
 OVAL = 0.6  # pixels that outlines may move away from the labels by as a body is made round, its instances where they are: not an oval
+LARGE = 40.0  # pixels, root of the area of what views show: outlines of smaller ones tell no axes
 
 
 def placed_round(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions) -> tuple[Mesh, np.ndarray] | None:
     """(mesh, poses (N, 4, 4)) of a body of revolution, made round, with its instances where outlines have them then; None of others, and of
     one that outlines say is oval. For poses that textures do not tell better: where these lie on one another they do, and mesh and outlines
     agree as they are."""
-    axis = None if "rounding" in options.without else body_axis(mesh)
+    large = np.median([np.sqrt(v.mask.sum()) for v in views]) >= LARGE
+    axis = body_axis(mesh) if large and "rounding" not in options.without else None
     if axis is None:
         return None
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
