@@ -32,7 +32,7 @@ from relit.fit.pose_passes import (
     related,
     shape_and_poses,
 )
-from relit.fit.round_bodies import placed_round
+from relit.fit.round_bodies import made_round
 from relit.fit.sought_again import sought_again
 from relit.fit.turn_guess import others_of, turned_alike
 from relit.fit.vessel_trial import vessel_of
@@ -68,12 +68,11 @@ def shape_stages(
         mesh = extract_mesh(values, faces=options.faces)
         if follow is not None:
             mesh, poses, _ = follow(mesh, views, poses, run, options)
-        even = placed_round(mesh, views, poses, run, options) if rate > 0 and follow is not placed_by_outlines else None
-        if even is not None:
-            mesh, poses = even
+        if follow is not placed_by_outlines:  # where textures lie on one another, poses have left no bumps
+            mesh = made_round(mesh, views, poses, run, options)
         if vague:
             there, turned = [v for v, _ in vague], np.array([p for _, p in vague])
-            if follow is not None or even is not None:
+            if follow is not None:
                 _, turned, _ = placed_by_outlines(mesh, there, turned, run, options, still=True)
             views, poses = [*views, *there], np.concatenate([poses, turned])
         mesh, how = unwrap(mesh, options.texture)
@@ -92,9 +91,8 @@ def shape_stages(
         poses = parts["poses"]
         plane = np.zeros((0, 3)) if "ground" in options.without else find_ground(mesh.vertices, poses)
         if len(plane) and rate > 0 and len(scene.motions) == 1:
-            resting, plane, count = set_down(mesh.vertices, poses, plane, distance_in(values))
-            if even is None and count:  # on a round body outlines know distances better than the ground does
-                poses = resting
+            poses, plane, count = set_down(mesh.vertices, poses, plane, distance_in(values))
+            if count:
                 run.say(f"{count} instances were moved along their lines of sight towards the ground, or what they rest on")
         if len(plane) == 0:
             run.say("note: no ground was found that the instances stand on; nothing but they themselves casts shadows")

@@ -60,16 +60,15 @@ def follow_outlines(mesh: Mesh, cameras: list[Camera], masks: list[np.ndarray], 
 
 
 def follow_with_poses(
-    mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3, turning: bool = True, still: bool = False, held=None
+    mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3, turning: bool = True, still: bool = False
 ) -> tuple[Mesh, np.ndarray]:
     """As `follow_outlines`, with the poses of the cameras (N, 4, 4) moved too, each round before the mesh. known: (H, W) each, 1 where what
-    the mask says counts. turning: False where the cameras move along and across their lines of sight alone. still: the mesh stays. held:
-    (3,) direction in the mesh's frame about which nothing turns, or None."""
+    the mask says counts. turning: False where the cameras move along and across their lines of sight alone. still: the mesh stays."""
     for _ in range(rounds):
         scene = build_geometry(mesh)
         for _ in range(2):
             found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
-            cameras = [c.with_pose(moved_camera(c, outline, turning, held)) for c, outline in zip(cameras, found, strict=True)]
+            cameras = [c.with_pose(moved_camera(c, outline, turning)) for c, outline in zip(cameras, found, strict=True)]
         if not still:
             mesh = moved(mesh, solve(mesh, [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]))
     return mesh, np.array([c.world_from_camera for c in cameras])
@@ -82,23 +81,17 @@ def outline_misfit(mesh: Mesh, cameras: list[Camera], masks, known) -> float:
     return float(np.median(np.abs(np.concatenate(found)))) if sum(map(len, found)) else 0.0
 
 
-def moved_camera(camera: Camera, outline: Outline, turning: bool = True, held: np.ndarray | None = None) -> np.ndarray:
+def moved_camera(camera: Camera, outline: Outline, turning: bool = True) -> np.ndarray:
     """The camera's pose (4, 4) with which the outline moves as its samples ask for: one Gauss-Newton step over turns about the middle of
-    what is seen, unless turning is False, and translations. held: see `follow_with_poses`."""
+    what is seen, unless turning is False, and translations."""
     if len(outline.point) < 30:
         return np.asarray(camera.world_from_camera, np.float64)
     middle, free = outline.point.mean(0), slice(0 if turning else 3, 6)
-    rows, trust = by_motion(camera, outline, middle), precision(outline.shift)
-    still = np.eye(6)
-    if held is not None:
-        axis = camera.camera_from_world[:3, :3] @ held
-        still[:3, :3] -= np.outer(axis, axis)
-    rows = (rows @ still)[:, free]
+    rows, trust = by_motion(camera, outline, middle)[:, free], precision(outline.shift)
     normal = (rows * trust[:, None]).T @ rows
     normal += 1e-6 * np.diag(np.diag(normal))
     step = np.zeros(6)
     step[free] = np.linalg.solve(normal, rows.T @ (trust * outline.shift))
-    step = still @ step
     return after_motion(camera, step, middle)
 
 

@@ -23,7 +23,6 @@ from relit.fit.odd_instances import odd_instances
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
 from relit.fit.register import crop_rings
-from relit.fit.round_bodies import placed_round
 from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.geometry.hull import NoShape
@@ -46,7 +45,7 @@ class Pass:
     """What a volume pass for the poses alone gives. poses: (N, 4, 4). odd: (N,) bool, who shows what does not agree with the model of all.
     turn: degrees by which it has turned the instances, the median. off: pixels, see `followed`. symmetry: of its shape; None where that is
     not even. mixed: whether instances were turned then by which the object nearly looks like itself: what it has built is of no use. round:
-    whether it is a body of revolution whose instances stand where outlines have them on one that is round."""
+    whether that shape is a body of revolution."""
 
     poses: np.ndarray
     odd: np.ndarray
@@ -62,14 +61,12 @@ class Pass:
         return self.off is not None and self.off < CLOSE
 
     def arrived(self, last: Pass | None) -> bool:
-        """Whether another one would only lead the poses away again: outlines have told them on a round body, or textures brought them back
-        to where they had been before, or as close together as flow can tell, or hardly closer than in the pass before."""
-        if self.round:
-            return True
+        """Whether another one would only lead the poses away again: textures brought them back to where they had been before, or as close
+        together as flow can tell, or hardly closer than in the pass before. Labels alone would turn a body of revolution about its axis."""
         if self.off is None or self.mixed:
             return False
         settled = last is not None and last.off is not None and not last.mixed and self.off > CLOSER * last.off
-        return settled or self.turn < ARRIVED or self.exact
+        return settled or self.turn < ARRIVED or self.exact or self.round
 
 
 def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
@@ -98,7 +95,7 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
         return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved), *flags)
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
-        before, off, turned, even = poses, None, None, None
+        before, off, turned = poses, None, None
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, last and last.symmetry)
         odd = odd_instances(bank, model, seed)
         for k in np.flatnonzero(odd):
@@ -109,13 +106,8 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
             better, moved, off = followed(mesh, some, poses[~odd], run, options)
             if off is not None:
                 mesh, poses[~odd] = better, moved
-            if off is None or off >= CLOSE:
-                even = placed_round(mesh, some, poses[~odd], run, options)
-            if even is not None:
-                mesh, poses[~odd] = even
-            if off is not None:
                 if off >= CLOSE or (last and last.mixed):  # where textures lie on one another all stand right, but after a mixed pass
-                    turned = told_apart(mesh, some, poses[~odd], run, options, seed)
+                    turned = told_apart(mesh, some, moved, run, options, seed)
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
         symmetry = None if "symmetry" in options.without or turned is not None else find_symmetry(mesh, views, poses)
         if number == 0 and symmetry is not None:
@@ -123,7 +115,7 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
         if turned is not None:
             poses[~odd] = turned
         kept = {} if off is None else {"off": off}
-        flags = {"mixed": turned is not None, "round": even is not None}
+        flags = {"mixed": turned is not None, "round": body_axis(mesh) is not None}
         stage.save("joint", poses=poses, odd=odd, turn=turn, **flags, **kept, **(symmetry.arrays if symmetry else {}))
     return Pass(poses, odd, turn, off, symmetry, **flags)
 
