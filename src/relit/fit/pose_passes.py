@@ -44,8 +44,7 @@ CLOSE, CLOSER = 0.25, 0.8  # so was one that leaves textures within these pixels
 class Pass:
     """What a volume pass for the poses alone gives. poses: (N, 4, 4). odd: (N,) bool, who shows what does not agree with the model of all.
     turn: degrees by which it has turned the instances, the median. off: pixels, see `followed`. symmetry: of its shape; None where that is
-    not even. mixed: whether instances were turned then by which the object nearly looks like itself: what it has built is of no use. round:
-    whether that shape is a body of revolution."""
+    not even. mixed: whether instances were turned then by which the object nearly looks like itself: what it has built is of no use."""
 
     poses: np.ndarray
     odd: np.ndarray
@@ -53,7 +52,6 @@ class Pass:
     off: float | None
     symmetry: Symmetry | None
     mixed: bool = False
-    round: bool = False
 
     @property
     def exact(self) -> bool:
@@ -62,11 +60,11 @@ class Pass:
 
     def arrived(self, last: Pass | None) -> bool:
         """Whether another one would only lead the poses away again: textures brought them back to where they had been before, or as close
-        together as flow can tell, or hardly closer than in the pass before. Labels alone would turn a body of revolution about its axis."""
+        together as flow can tell, or hardly closer than in the pass before."""
         if self.off is None or self.mixed:
             return False
         settled = last is not None and last.off is not None and not last.mixed and self.off > CLOSER * last.off
-        return settled or self.turn < ARRIVED or self.exact or self.round
+        return settled or self.turn < ARRIVED or self.exact
 
 
 def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
@@ -91,8 +89,7 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
     if run.done(name):
         saved = run_arrays(run, name, "joint")
         off = float(saved["off"]) if "off" in saved else None
-        flags = (bool(saved.get(name, False)) for name in ("mixed", "round"))
-        return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved), *flags)
+        return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved), bool(saved.get("mixed", False)))
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
         before, off, turned = poses, None, None
@@ -115,9 +112,8 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
         if turned is not None:
             poses[~odd] = turned
         kept = {} if off is None else {"off": off}
-        flags = {"mixed": turned is not None, "round": body_axis(mesh) is not None}
-        stage.save("joint", poses=poses, odd=odd, turn=turn, **flags, **kept, **(symmetry.arrays if symmetry else {}))
-    return Pass(poses, odd, turn, off, symmetry, **flags)
+        stage.save("joint", poses=poses, odd=odd, turn=turn, mixed=turned is not None, **kept, **(symmetry.arrays if symmetry else {}))
+    return Pass(poses, odd, turn, off, symmetry, turned is not None)
 
 
 def told_apart(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
