@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from relit.geometry.mesh import vertex_areas
 from relit.geometry.revolution_axis import Axis
 from relit.geometry.tangents import vertex_normals
 from relit.scene import Mesh
@@ -115,10 +116,3 @@ def towards_curve(tree: cKDTree, cloud, place, normal, weight, turn, some: np.nd
 def ramp(x: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
     """0 below the first end, 1 from the second on, even in between."""
     return np.clip((x - ends[0]) / (ends[1] - ends[0]), 0, 1)
-
-
-def vertex_areas(mesh: Mesh) -> np.ndarray:
-    """(V,) a third of the faces about each vertex."""
-    a, b, c = np.moveaxis(np.asarray(mesh.vertices, np.float64)[mesh.faces], 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    return np.bincount(mesh.faces.ravel(), np.repeat(area, 3), len(mesh.vertices))
