@@ -24,7 +24,8 @@ def start(seed=0, hats=4):
 
 
 def flat(a):
-    return mi.Float(np.ascontiguousarray(a, np.float32).ravel())
+    """Copied into Dr.Jit's own memory: NumPy's is lent as it lies, and whether four values are read at once depends on how it is aligned."""
+    return mi.Float(np.asarray(a, np.float32).ravel().tolist())
 
 
 def move(exchange, light, colour, g_light, g_colour, rate=0.02, metallic=None):

@@ -18,7 +18,8 @@ class Adam:
         """floor: adds floor * mean(v) to each entry's second moment, so that entries whose gradient is small noise stay where they are
         (plain Adam moves them as fast as any other)."""
         self.floor = floor
-        self.m, self.v = dr.zeros(mi.Float, size), dr.zeros(mi.Float, size)
+        # arrays in memory, not literal zeros: the first step runs the kernels of all others
+        self.m, self.v = dr.opaque(mi.Float, 0.0, size), dr.opaque(mi.Float, 0.0, size)
         self.beta1, self.beta2, self.t = beta1, beta2, 0
 
     def step(self, parameter, gradient, rate: float, ratio=1.0):
