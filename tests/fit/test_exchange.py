@@ -24,7 +24,7 @@ def start(seed=0, hats=4):
 
 
 def flat(a):
-    """Copied into Dr.Jit's own memory: NumPy's is lent as it lies, and whether four values are read at once depends on how it is aligned."""
+    """Copied into Dr.Jit's own memory: NumPy's is lent as it lies, and which kernel reads it depends on how it is aligned."""
     return mi.Float(np.asarray(a, np.float32).ravel().tolist())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -21,6 +22,10 @@ from relit.fit.turn_guess import turned_by
 from relit.fit.turns import turned_about
 from relit.geometry.revolution_axis import Axis
 from relit.rendering.shade_world import shade_world, start_world_light
+
+
+def none(seed):
+    """No galleries: places are given."""
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +49,15 @@ def test_it_is_found_though_half_of_it_is_hidden_and_it_stands_in_the_shade(lump
     monkeypatch.setattr(module, "VIEWPOINTS", 500)
     monkeypatch.setattr(module, "STEPS", 120)
     before = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
+    galleries = cache(partial(module.galleries_of, model, float(np.linalg.norm(poses[0, :3, 3]))))
     level = float(view_errors(pixel_bank([hidden], poses[:1]), model)[0]) / 80  # a tenth of what it is at a wrong place agrees
-    found, certain = sought_again(hidden, guide, poses[0], model, level, None)
+    found, certain = sought_again(hidden, guide, poses[0], model, level, None, galleries)
     assert certain
     assert rotation_angle(found[:3, :3].T @ poses[1][:3, :3]) < 1.5
     assert np.linalg.norm(found[:3, 3] - poses[1][:3, 3]) < 0.1
     mirrored = replace(hidden, rgb=hidden.rgb[:, ::-1], mask=hidden.mask[:, ::-1], known=hidden.known[:, ::-1])
-    assert sought_again(mirrored, guide, poses[0], model, level, None) == (None, False)
+    assert sought_again(mirrored, guide, poses[0], model, level, None, galleries) == (None, False)
+    assert galleries.cache_info().hits == 1  # those of the first who was sought
     after = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))  # the model itself stays
 
@@ -62,7 +69,7 @@ def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
     monkeypatch.setattr(module, "candidates", lambda *_: turned)
     for errors, out in (([1.0, 1.5], True), ([1.0, 3.0], False), ([9.0, 30.0], True)):
         monkeypatch.setattr(module, "descended", lambda *_, e=errors: (turned, np.array(e)))
-        assert (sought_again(hidden, guide, poses[0], model, 1.0, None)[0] is None) == out
+        assert (sought_again(hidden, guide, poses[0], model, 1.0, None, none)[0] is None) == out
 
 
 def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turned(lump, monkeypatch):
@@ -84,11 +91,11 @@ def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turne
         asked.append(view)
         return turned_by(pose, axis, -1.01)
 
-    found, sure = sought_again(guide, guide, poses[0], model, 1.0, None, turned=turned)
+    found, sure = sought_again(guide, guide, poses[0], model, 1.0, None, none, turned=turned)
     assert np.allclose(found, poses[0]) and not sure and asked == [guide]
-    assert sought_again(guide, guide, poses[0], model, 1.0, None) == (None, False), "not a body of revolution"
+    assert sought_again(guide, guide, poses[0], model, 1.0, None, none) == (None, False), "not a body of revolution"
     monkeypatch.setattr(module, "overlaps", lambda render, view, some: np.full(len(some), 0.5))
-    assert sought_again(guide, guide, poses[0], model, 1.0, None, turned=turned) == (None, False)
+    assert sought_again(guide, guide, poses[0], model, 1.0, None, none, turned=turned) == (None, False)
 
 
 def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
@@ -103,7 +110,7 @@ def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
             return poses[[1, 0]], np.array(errors_of_turn[len(asked) - 1])
 
         monkeypatch.setattr(module, "descended", descended)
-        return sought_again(hidden, guide, poses[0], None, 1.0, None, 5)[0]
+        return sought_again(hidden, guide, poses[0], None, 1.0, None, none, 5)[0]
 
     monkeypatch.setattr(module, "candidates", lambda *_: poses[[1, 0]])
     assert np.array_equal(found([[20.0, 30.0], [3.0, 30.0]]), poses[1]) and asked == [5, 6]
@@ -116,9 +123,9 @@ def test_of_one_whose_axis_is_known_all_turns_are_tried_and_the_best_is_taken(lu
     level = float(view_errors(pixel_bank([hidden], poses[:1]), model)[0]) / 40
     turned = turned_about(poses[1], 2.0)
     assert rotation_angle(turned[:3, :3].T @ poses[1][:3, :3]) > 100
-    found, certain = sought_again(hidden, guide, poses[0], model, level, None, on_axis=turned)
+    found, certain = sought_again(hidden, guide, poses[0], model, level, None, none, on_axis=turned)
     assert certain and rotation_angle(found[:3, :3].T @ poses[1][:3, :3]) < 6
-    found, certain = sought_again(hidden, guide, poses[0], model, 1e-9 * level, None, on_axis=turned)  # nothing agrees: a guess
+    found, certain = sought_again(hidden, guide, poses[0], model, 1e-9 * level, None, none, on_axis=turned)  # nothing agrees: a guess
     assert not certain and found is not None
 
 

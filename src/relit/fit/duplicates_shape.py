@@ -5,6 +5,7 @@ found again, the mesh, and the ground that they stand on. For the recipe `duplic
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache, partial
 
 import mitsuba as mi
 import numpy as np
@@ -33,7 +34,7 @@ from relit.fit.pose_passes import (
     shape_and_poses,
 )
 from relit.fit.round_bodies import made_round
-from relit.fit.sought_again import sought_again
+from relit.fit.sought_again import galleries_of, sought_again
 from relit.fit.turn_guess import others_of, turned_alike
 from relit.fit.vessel_trial import vessel_of
 from relit.fit.vessels import body_axis
@@ -210,9 +211,10 @@ def with_found(
     level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
     mesh = extract_mesh(dense_values(model.grid))
+    galleries = cache(partial(galleries_of, model, float(np.linalg.norm(poses[0][:3, 3]))))
     found, vague, turned = [], [], turned_by_others(mesh, views, poses)
     for view in others:
-        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, seed, on_axes.get(view.key), turned)
+        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, galleries, seed, on_axes.get(view.key), turned)
         if pose is not None and not sure:
             run.say(f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess")
         else:

@@ -21,7 +21,7 @@ from relit.fit.instance_options import DETAILED
 from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved_poses, overlaps, pixel_bank
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
-from relit.fit.register import crop_rings, directions_around, make_gallery, refine, views_from, volume_render
+from relit.fit.register import Gallery, crop_rings, directions_around, refine, rings_of, views_from, volume_render
 from relit.fit.revolution import UP
 from relit.fit.turn_guess import all_turns
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
@@ -29,8 +29,8 @@ from relit.geometry.revolution_axis import Axis
 from relit.rendering.shade_world import SHADE, SHADOW_RATE, shade_world
 
 VIEWPOINTS = 2500
-PARTS = (0.5, 2.0, 0.6)  # weights of fit.register's descriptors that are tried beside DETAILED: one light, so brightness tells
-TRIES = 12  # places of an instance that are tried, half of them under each descriptor and these at least APART degrees from each other
+PLACED = DETAILED, (0.5, 2.0, 0.6)  # weights of fit.register's descriptors: one light, so brightness tells
+TRIES = 12  # places of an instance that are tried, half of them under each and these at least APART degrees from each other
 APART = 12.0
 AGREES = 8.0  # times the median error of the others at most: paint that this instance alone shows is not in the model
 CLEARLY = 2.0  # times as much it is at any other place
@@ -48,6 +48,7 @@ def sought_again(
     model: VolumeModel,
     level: float,
     turns: Callable | None,
+    galleries: Callable[[int], list[Gallery]],
     seed: int = 0,
     on_axis: np.ndarray | None = None,
     turned: Callable[[View, np.ndarray], np.ndarray] | None = None,
@@ -56,14 +57,14 @@ def sought_again(
     places.
 
     guide: a view that the model was fitted to, and its pose; it stays and tells where the scene is. level: median error of such views (see
-    `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. on_axis: a pose that is right up to a turn
-    about the object's y axis: all turns are tried, and the best is taken, certain or not. turned: for an object that is a body of
-    revolution, handles aside, whose silhouette tells all but the turn about the axis: of a view and its pose (4, 4), the pose with which it
-    shows what the others show (`turn_guess.turned_alike`); where nothing is certain the best place whose silhouette agrees is taken then.
+    `view_errors`). turns: what tells views their `turns` of `shade_world`; None for one photo. galleries: see `galleries_of`, by seed.
+    on_axis: a pose that is right up to a turn about the object's y axis: all turns are tried, and the best is taken, certain or not.
+    turned: for an object that is a body of revolution, handles aside, whose silhouette tells all but the turn about the axis: of a view and
+    its pose (4, 4), the pose with which it shows what the others show (`turn_guess.turned_alike`); where nothing is certain the best place
+    whose silhouette agrees is taken then.
     """
-    distance = float(np.linalg.norm(guide_pose[:3, 3]))
     for turn in range(ROUNDS if on_axis is None else 1):
-        poses = candidates(view, model, distance, seed + turn) if on_axis is None else all_turns(on_axis, Axis(np.zeros(3), UP), TURNS)
+        poses = candidates(view, model, galleries(seed + turn)) if on_axis is None else all_turns(on_axis, Axis(np.zeros(3), UP), TURNS)
         if len(poses) == 0:
             continue
         poses, errors = descended(view, guide, guide_pose, poses, model, turns, seed + turn)
@@ -95,13 +96,19 @@ def where_outlines_agree(errors: np.ndarray, view: View, poses: np.ndarray, mode
     return np.where(left <= min(1 - OUTLINE, AS_WELL * left.min()), errors, np.nan)
 
 
-def candidates(view: View, model: VolumeModel, distance: float, seed: int) -> np.ndarray:
+def galleries_of(model: VolumeModel, distance: float, seed: int) -> list[Gallery]:
+    """The model seen from all sides, from a distance, as each of PLACED describes it. They serve all who are sought."""
+    cameras = views_from(directions_around(VIEWPOINTS, seed), distance)
+    rgb, alpha = albedo_render(model)(cameras)
+    return [Gallery(cameras, rings_of(rgb, alpha, parts=parts)) for parts in PLACED]
+
+
+def candidates(view: View, model: VolumeModel, galleries: list[Gallery]) -> np.ndarray:
     """(at most TRIES, 4, 4) places that look most like the view, by rendering."""
     crops, render = crops_of([view]), albedo_render(model)
     found = []
-    for parts in (DETAILED, PARTS):
+    for parts, gallery in zip(PLACED, galleries, strict=True):
         rings = crop_rings(crops, parts)
-        gallery = make_gallery(render, views_from(directions_around(VIEWPOINTS, seed), distance), parts)
         looked = look_for([view], crops, gallery, rings, parts, keep=TRIES // 2, apart=APART)
         for k in range(TRIES // 2):
             if looked.scores[0, k] > -1:
