@@ -46,7 +46,7 @@ from relit.scene import Camera, Mesh
 EXACT = 0.7  # pixels by which textures may be off before they have a part in it
 TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, or both of a softer mesh
 SETTLED = 0.02  # degrees by which a pose turns in the last one
-SHARP = 0.5  # pixels by which textures may be off before the shape is doubted
+SHARP, WHOLLY = 0.5, 0.2  # pixels that textures alone may leave, and share of what labels leave, before the shape is doubted
 YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
 LABELS = 0.7  # pixels; what has contradicted textures is told no better than this
 FAINTEST = 0.15  # pixels; flow is told no better than this
@@ -82,7 +82,7 @@ def follow_views(
     if before <= EXACT:
         return outlined, poses, None
     placed = by_textures(outlined, with_poses(cameras, poses), pictures, masks)
-    if misfit(texture_shifts(outlined, placed, pictures, masks)) < SHARP:
+    if misfit(texture_shifts(outlined, placed, pictures, masks)) < min(SHARP, WHOLLY * before):
         found, placed = by_both(outlined, placed, pictures, masks, known, BOTH)
     else:  # not the labels, then: the shape
         found, placed = by_both(outlined, with_poses(cameras, poses), pictures, masks, known, SOFT, YIELDING)
