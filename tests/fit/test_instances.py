@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Growth, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged, staying
 from relit.fit.instance_rounds import LOW, ambiguous, crops_of, nearer, reconsider, regrown, settled, trusted
-from relit.fit.instance_search import first_starts, place
+from relit.fit.instance_search import TORN, first_starts, place, without_torn
 from relit.fit.instances import (
     albedo_render,
     carved,
@@ -245,9 +246,17 @@ def test_what_doubt_moves_is_kept_only_where_all_agree_no_worse(monkeypatch):
     for levels, moved in (([0.9, 0.8], False), ([0.9, 0.95], True)):
         told = iter(levels)
         monkeypatch.setattr(instance_rounds, "agreement_of", lambda *_, told=told: next(told, 0.95))
-        poses, _ = settled(views, crops, rings, truth.copy(), np.ones(4), Search(rounds_doubted=2), seed=0)
-        assert np.array_equal(poses, sent if moved else truth)
+        poses, _, torn = settled(views, crops, rings, truth.copy(), np.ones(4), Search(rounds_doubted=2), seed=0)
+        assert np.array_equal(poses, sent if moved else truth) and torn == (set() if moved else {2})
     assert asked[:2] == [set(), {2}]  # who was brought back is not asked again
+
+
+def test_who_is_torn_is_left_to_the_end_where_it_can_be_spared():
+    said, view = [], SimpleNamespace(label=7)
+    left = without_torn([view] * 10, np.full(10, 0.9), {1, 4}, said.append)
+    assert np.flatnonzero(left == TORN).tolist() == [1, 4] and left.max() == 0.9 and "7, 7 may stand wrong" in said[0]
+    for count, torn in ((10, set()), (10, {1, 2, 3}), (8, {1})):  # none, too many of all, too few would be left
+        assert (without_torn([view] * count, np.full(count, 0.9), torn, said.append) == 0.9).all() and len(said) == 1
 
 
 def test_a_link_from_matching_gives_a_pose_from_either_side():

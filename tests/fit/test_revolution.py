@@ -161,7 +161,7 @@ def placed(bottles, monkeypatch, sure):
     monkeypatch.setattr("relit.fit.instance_revolution.fit_revolution", lambda *a: body)
     monkeypatch.setattr("relit.fit.instance_revolution.seats_of", lambda *a: seats)
     monkeypatch.setattr("relit.fit.instance_revolution.turned_by_decoration", lambda *a: {"colour": Told(told.poses, sure)})
-    monkeypatch.setattr(instance_search, "settled", lambda views, crops, rings, poses, scores, o, **_: (poses, scores))
+    monkeypatch.setattr(instance_search, "settled", lambda views, crops, rings, poses, scores, o, **_: (poses, scores, set()))
     found = instance_search.place(views, OPTIONS, say=said.append)
     off = min(([off_axis(p, t, sign) for p, t in zip(found.poses, bottles[2], strict=True)] for sign in (1, -1)), key=sum)
     assert np.median(off) < 6, off

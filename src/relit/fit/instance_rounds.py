@@ -76,14 +76,15 @@ def descend(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=D
 
 
 def settled(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=DETAILED, say=lambda text: None):
-    """Poses that have grown, made exact, and doubted; (poses, scores). What doubt moves is kept where all agree no worse for it."""
+    """Poses that have grown, made exact, and doubted; (poses, scores, torn). What doubt moves is kept where all agree no worse for it.
+    torn: indices of those who agree better elsewhere with the model of the others, while all agree less for it."""
     poses, scores = settle(views, crops, rings, poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say)
     poses, scores = descend(views, crops, rings, poses, scores, o, seed=seed + 20, parts=parts, say=say)
     poses, scores = regrown(views, crops, rings, poses, scores, o, seed=seed + 100, parts=parts, say=say)
     if not o.descents or len(views) < 3 or not o.rounds_doubted:
-        return poses, scores
+        return poses, scores, set()
     detail = crop_rings(crops, DETAILED)  # colour alone puts a spotted cow on any of its white sides
-    late, sure, agreement = False, set(), agreement_of(views, poses, o, seed)
+    late, sure, torn, agreement = False, set(), set(), agreement_of(views, poses, o, seed)
     for turn in range(o.rounds_doubted):
         sent, _, moved = reconsider(
             views, crops, detail, poses.copy(), scores, o, seed=seed + 30 + turn, parts=DETAILED, sure=sure, say=say
@@ -95,6 +96,7 @@ def settled(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=D
         if better < agreement - SLACK:
             say(f"all agree less for it ({agreement:.3f} -> {better:.3f}): they stay where they were")
             sure |= set(moved)
+            torn |= set(moved)
             continue
         sure |= {k for k in moved if nearer(again[k], poses[k], sent[k])}  # brought back: asked again, they would be sent again
         late, poses, scores, agreement = True, again, level, max(agreement, better)
@@ -103,7 +105,9 @@ def settled(views, crops, rings, poses, scores, o: Search, *, seed: int, parts=D
         poses, scores = descend(views, crops, rings, poses, scores, o, seed=seed + 50 + turn, parts=parts, say=say)
         if np.median([rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(before, poses, strict=True)]) < STILL:
             break
-    return regrown(views, crops, rings, poses, scores, o, seed=seed + 200, parts=parts, say=say) if late else (poses, scores)
+    if late:
+        poses, scores = regrown(views, crops, rings, poses, scores, o, seed=seed + 200, parts=parts, say=say)
+    return poses, scores, torn
 
 
 def agreement_of(views, poses: np.ndarray, o: Search, seed: int) -> float:

@@ -31,6 +31,8 @@ from relit.fit.mirror_plane import flipped_views
 from relit.fit.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
 
+SPARED, ENOUGH = 0.2, 8  # share of the instances that can be left to the end, and those whose model is to say where they stand
+TORN = -3.0  # score of such an instance
 LEFT_OUT = -2.0  # score of an instance whose turn about a known axis is not told; that of a place that shows nothing is -1
 
 
@@ -107,11 +109,21 @@ def place(views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda t
         doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
         say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
     rings = crop_rings(crops, best.parts)
-    poses, scores = settled(views, crops, rings, best.poses, best.own, o, seed=seed, parts=best.parts, say=say)
+    poses, scores, torn = settled(views, crops, rings, best.poses, best.own, o, seed=seed, parts=best.parts, say=say)
     turned = coherent_turns(views, crops, crop_rings(crops, DETAILED), poses, o, seed=seed + 70, say=say) if len(views) > 3 else None
     if turned is not None:
         poses, scores = descend(views, crops, rings, turned.poses, turned.own, o, seed=seed + 80, parts=best.parts, say=say)
-    return Found(poses, scores, believed(best, o))
+    return Found(poses, without_torn(views, scores, torn, say), believed(best, o))
+
+
+def without_torn(views: list[View], scores: np.ndarray, torn: set[int], say) -> np.ndarray:
+    """The scores (N,), TORN of those who agree better elsewhere with the others while all agree less for it (`settled`): one in a wrong
+    place has bent the others towards itself. Where these few can be spared, their place is for the finished model of the others to say."""
+    if not torn or len(torn) > SPARED * len(views) or len(views) - len(torn) < ENOUGH:
+        return scores
+    labels = ", ".join(str(views[k].label) for k in sorted(torn))
+    say(f"note: {labels} may stand wrong, as the model of the others says and that of all denies: left to the end")
+    return np.where(np.isin(np.arange(len(views)), list(torn)), TORN, scores)
 
 
 def up_to_turns(views, crops, placed: Placed, o: Search, *, seed: int, links=(), say=lambda text: None) -> Placed:
