@@ -5,7 +5,7 @@ found again, the mesh, and the ground that they stand on. For the recipe `duplic
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import lru_cache, partial
 
 import mitsuba as mi
 import numpy as np
@@ -211,7 +211,7 @@ def with_found(
     level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
     mesh = extract_mesh(dense_values(model.grid))
-    galleries = cache(partial(galleries_of, model, float(np.linalg.norm(poses[0][:3, 3]))))
+    galleries = lru_cache(1)(partial(galleries_of, model, float(np.linalg.norm(poses[0][:3, 3]))))  # they are large
     found, vague, turned = [], [], turned_by_others(mesh, views, poses)
     for view in others:
         pose, sure = sought_again(view, views[0], poses[0], model, level, turns, galleries, seed, on_axes.get(view.key), turned)
