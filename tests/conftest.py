@@ -12,10 +12,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "2")
 
 @pytest.fixture(scope="session", autouse=True)
 def device() -> str:
-    """Mitsuba's variant is set before anything touches its types."""
+    """Mitsuba's variant is set before anything touches its types; `RELIT_TEST_DEVICE` may name `cuda`."""
     from relit.device import use_device
 
-    return use_device("cpu")
+    return use_device(os.environ.get("RELIT_TEST_DEVICE", "cpu"))
 
 
 @pytest.fixture(scope="session")

@@ -78,3 +78,15 @@ def test_what_shows_nothing_whole_stays_as_it_is(photographed):
     asset, camera, view, pose = photographed
     hidden = replace(view, known=np.zeros_like(view.known))
     assert np.allclose(turned_as_shown(asset, [hidden], [camera], pose[None], AXIS)[0], pose)
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi])
+def test_where_two_turns_look_alike_the_one_it_has_stays(photographed, angle):
+    asset, camera, view, pose = photographed
+    paint = asset.material.base_color
+    alike = replace(asset, material=replace(asset.material, base_color=(paint + paint[::-1, ::-1]) / 2))
+    picture = as_photographed(alike)("photo", camera, spp=64)[..., :3]
+    guess = turned_by(pose, AXIS, angle)
+    begun = module.moved(alike, {7: np.linalg.inv(guess) @ pose})
+    found = turned_as_shown(begun, [replace(view, rgb=picture * 0.9)], [camera], guess[None], AXIS)  # a light that is somewhat off
+    assert rotation_angle(found[0][:3, :3] @ guess[:3, :3].T) < 3.0

@@ -2,7 +2,8 @@
 
 What is placed on its axis by its outline alone (fit/turn_guess.py) is turned by how much its picture looks like the others'. Under one
 light they hardly do: gloss and shading stand still while the paint turns. Rendered, every turn shows what it would look like, gloss and
-all; the one that differs least from the photo is taken. Such an instance takes no part in shape and paint, before and after.
+all; the one that differs least from the photo is taken. Where what it shows looks nearly the same at several turns, the materials'
+errors would choose: the turn it has stays then. Such an instance takes no part in shape and paint, before and after.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from relit.rendering.mitsuba_scene import Scene, render
 from relit.rendering.photographed import lit_scene
 from relit.scene import Asset, Camera
 
-TURNS, PLACES = 24, 3  # about the axis; of these the best ones that their neighbours do not beat are looked into
+TURNS, PLACES = 24, 3  # about the axis; of these its own and the best ones that their neighbours do not beat are looked into
+CLEARLY = 0.8  # of what differs at its own turn that may differ elsewhere at most, or it stays: wrong turns were seen to leave .9 of it
 HALVINGS = 2  # how often half the way to the next turn is tried on both sides
 SCENES = TURNS + 2 * HALVINGS * PLACES  # that are rendered
 SIDE, SAMPLES = 128, 8  # pixels of the pictures that are compared, longer side; rays a pixel of each of two pictures
@@ -56,18 +58,29 @@ def turned_as_shown(
 
     grid = 2 * np.pi / TURNS * np.arange(TURNS)
     found = np.array([differences(np.full(len(views), a)) for a in grid])
-    hollow = (found <= np.roll(found, 1, 0)) & (found <= np.roll(found, -1, 0))
-    order = np.argsort(np.where(hollow, found, np.inf), axis=0)  # a window seen a little aslant can be worse than another one seen right
-    best, least = grid[found.argmin(0)], found.min(0)
-    for place in order[:PLACES]:
+    ends = []
+    for place in places(found)[:PLACES]:  # a window seen a little aslant can be worse than another one seen right
         angle, value, step = grid[place], np.take_along_axis(found, place[None], 0)[0], grid[1]
         for _ in range(HALVINGS):
             step, middle = step / 2, angle
             for side in (-step, step):
                 tried = differences(middle + side)
                 angle, value = np.where(tried < value, middle + side, angle), np.minimum(tried, value)
-        best, least = np.where(value < least, angle, best), np.minimum(value, least)
-    return np.array([turned_by(p, axis, a) for p, a in zip(poses, best, strict=True)])
+        ends.append((angle, value))
+    angles, values = (np.array(each) for each in zip(*ends, strict=True))
+    best = np.where(values.min(0) < CLEARLY * values[0], values.argmin(0), 0)
+    return np.array([turned_by(p, axis, a) for p, a in zip(poses, angles[best, np.arange(len(poses))], strict=True)])
+
+
+def places(found: np.ndarray) -> np.ndarray:
+    """(TURNS, V) numbers of the turns that are worth looking into, of differences (TURNS, V): first the best one within a step of the turn
+    that a view has, then those that their neighbours do not beat, the best first, then the rest."""
+    rank = np.where((found <= np.roll(found, 1, 0)) & (found <= np.roll(found, -1, 0)), found, np.inf)
+    near = np.array([0, 1, len(found) - 1])
+    own = near[found[near].argmin(0)]
+    rank[near] = np.inf
+    rank[own, np.arange(found.shape[1])] = -np.inf
+    return np.argsort(rank, axis=0, kind="stable")
 
 
 def compared(view: View) -> tuple[np.ndarray, np.ndarray]:
