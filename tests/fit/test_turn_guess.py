@@ -80,7 +80,7 @@ def test_outlines_put_an_axis_right_before_textures_are_asked(around, seed):
     mesh, views, poses = around
     others = others_of(mesh, views[1:], poses[1:])
     off = astray([views[0].camera.with_pose(poses[0])], 6.0, seed=seed)[0].world_from_camera
-    laid = on_outline(mesh, views[0], off)
+    laid = on_outline(others, views[0], off)
     after = rotation_angle(descended_alike(others, views[0], laid)[:3, :3].T @ poses[0][:3, :3])
     assert leaning(off, poses[0], AXIS) > 1.2 and leaning(laid, poses[0], AXIS) < 0.1 and after < 0.15
 

@@ -36,7 +36,8 @@ def run_suite(
     """Synthesize, reconstruct and evaluate every object of a suite, plain and with each ablation.
 
     assets: folder with `assets` and `envmaps`. objects: names to limit the suite to. ablate: names of the suite's ablations or `key=value`.
-    out: folder for the runs and the results, by default a new one in the cache. spp: samples a pixel when the result is rendered, by default what `relit evaluate` takes.
+    out: folder for the runs and the results, by default a new one in the cache. spp: samples a pixel when the
+    result is rendered, by default what `relit evaluate` takes.
     Returns {"suite", "quality", "device", "machine", "runs": {variant: {object: {"metrics", ...}}}, "means": {variant: {figure: value}}}.
     """
     from relit.device import use_device

@@ -166,13 +166,13 @@ def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
     return out
 
 
-def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known, least: float = 0.0) -> tuple[list[Rows], float]:
+def outline_rows(mesh: Mesh, cameras: list[Camera], masks, known, least: float = 0.0, scene=None) -> tuple[list[Rows], float]:
     """One equation for each sample of the outlines, across them; and their spread in pixels.
 
     least: spread that is taken at least; where it is given nearly all samples count, however far they are off: those that are farthest off
-    tell most of a wrong shape. Without, they are outliers (`outlines.precision`).
+    tell most of a wrong shape. Without, they are outliers (`outlines.precision`). scene: of `build_geometry`, where there is one.
     """
-    scene = build_geometry(mesh)
+    scene = scene or build_geometry(mesh)
     found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
     shift = np.concatenate([o.shift for o in found])
     spread = max(spread_of(shift) if len(shift) else 0.0, least)

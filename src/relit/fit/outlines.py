@@ -60,17 +60,19 @@ def follow_outlines(mesh: Mesh, cameras: list[Camera], masks: list[np.ndarray], 
 
 
 def follow_with_poses(
-    mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3, turning: bool = True, still: bool = False
+    mesh: Mesh, cameras: list[Camera], masks, known, rounds: int = 3, turning: bool = True, still: bool = False, scene=None
 ) -> tuple[Mesh, np.ndarray]:
     """As `follow_outlines`, with the poses of the cameras (N, 4, 4) moved too, each round before the mesh. known: (H, W) each, 1 where what
-    the mask says counts. turning: False where the cameras move along and across their lines of sight alone. still: the mesh stays."""
+    the mask says counts. turning: False where the cameras move along and across their lines of sight alone. still: the mesh stays.
+    scene: of `build_geometry`, where there is one of the mesh as it comes."""
     for _ in range(rounds):
-        scene = build_geometry(mesh)
+        scene = scene or build_geometry(mesh)
         for _ in range(2):
             found = [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]
             cameras = [c.with_pose(moved_camera(c, outline, turning)) for c, outline in zip(cameras, found, strict=True)]
         if not still:
             mesh = moved(mesh, solve(mesh, [outline_of(mesh, scene, c, m, k) for c, m, k in zip(cameras, masks, known, strict=True)]))
+            scene = None
     return mesh, np.array([c.world_from_camera for c in cameras])
 
 

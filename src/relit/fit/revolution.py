@@ -24,6 +24,8 @@ UP = np.array([0.0, 1.0, 0.0])  # the axis of revolution, in the object's frame
 OUTLINE = (1.0, 0.0, 0.0)  # weights of fit.register's descriptor: silhouettes only
 KNOTS, HOOPS = 16, 30  # radii of a profile, and circles that it is drawn with
 CELLS, AROUND = (48, 32), 24  # heights and radii, and turns about the axis, in which one silhouette is revolved
+ALONG = np.linspace(0, 1, HOOPS)  # the axis, from end to end
+CIRCLE = np.stack([f(np.arange(AROUND) * 2 * np.pi / AROUND) for f in (np.sin, np.cos)], -1)  # across it: x and z
 SHARE = 0.85  # of its turns in which a circle has to lie inside the silhouette; a handle fills a few of them
 TILTS = np.radians(np.arange(7.5, 91, 7.5))  # of the axis against the line of sight, that are tried
 
@@ -37,17 +39,19 @@ def radius_at(profile: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.where((s >= 0) & (s <= 1), np.maximum(np.interp(s, np.linspace(0, 1, KNOTS), profile[2:]), 0.01), -1.0)
 
 
-def hoops_of(profile: np.ndarray) -> np.ndarray:
-    """(HOOPS, AROUND, 3) circles around the axis."""
-    s, a = np.linspace(0, 1, HOOPS), np.arange(AROUND) * 2 * np.pi / AROUND
-    y = profile[0] + (profile[1] - profile[0]) * s
-    r = np.maximum(np.interp(s, np.linspace(0, 1, KNOTS), profile[2:]), 0.01)
-    return np.stack([r[:, None] * np.sin(a), np.broadcast_to(y[:, None], (HOOPS, AROUND)), r[:, None] * np.cos(a)], -1)
+def hoops_of(profile: np.ndarray, camera_from_object: np.ndarray) -> np.ndarray:
+    """(HOOPS, AROUND, 3) circles around the axis, in the camera's axes."""
+    m = camera_from_object
+    y = profile[0] + (profile[1] - profile[0]) * ALONG
+    r = np.maximum(np.interp(ALONG, np.linspace(0, 1, KNOTS), profile[2:]), 0.01)
+    return r[:, None, None] * (CIRCLE @ m[:3, [0, 2]].T) + (y[:, None] * m[:3, 1] + m[:3, 3])[:, None]
 
 
 def drawn(profile: np.ndarray, camera: Camera, finer: int = 2) -> np.ndarray:
-    """(H, W) in [0, 1]: the silhouette, as the union of the hulls of neighbouring circles."""
-    q = camera.project(hoops_of(profile).reshape(-1, 3))[:, :2].reshape(HOOPS, AROUND, 2) * finer
+    """(H, W) in [0, 1]: the silhouette, as the union of the hulls of neighbouring circles. Most of the time of a fit goes here."""
+    p = hoops_of(profile, camera.camera_from_world)
+    z = np.where(np.abs(p[..., 2]) < 1e-12, 1e-12, p[..., 2])
+    q = finer * np.stack([camera.fx * p[..., 0] / z + camera.cx, camera.fy * p[..., 1] / z + camera.cy], -1)
     pairs = np.concatenate([q[:-1], q[1:]], 1)
     out = np.zeros((camera.height * finer, camera.width * finer), np.uint8)
     for pair in np.round((pairs - 0.5) * 16).astype(np.int32):  # cv2: pixel centres at whole numbers, four bits behind the point

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import mitsuba as mi
 import numpy as np
 
@@ -41,7 +42,7 @@ from relit.geometry.revolution_axis import Axis
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
-TURNS = 120  # that are compared
+TURNS, SHRUNK = 120, 2  # that are compared, and by what pictures are smaller then
 PLACES = 8  # that descend
 OUTLINED, ROUNDS = 4, 8  # rounds of their descent: by outlines alone, then by both
 ASTRAY = 3.0  # degrees by which the axis leans after a descent that was led astray: the silhouette had told it better
@@ -79,12 +80,31 @@ def turned_alike(others: Others, view: View, pose: np.ndarray, axis: Axis) -> np
     """The pose (4, 4) of a view, right up to a turn about the axis, with which it shows what the others show. A guess even where one place
     is clearly the likeliest: half a turn of a pattern that repeats can look more alike than its own."""
     turns = all_turns(pose, axis, TURNS)
-    evidence = agreement(others, view, turns)
+    evidence = agreement(shrunk_others(others), shrunk(view), turns)
     peaks = np.flatnonzero((evidence >= np.roll(evidence, 1)) & (evidence >= np.roll(evidence, -1)))
-    starts = [on_outline(others.mesh, view, turns[k]) for k in peaks[np.argsort(-evidence[peaks])[:PLACES]]]
+    starts = [on_outline(others, view, turns[k]) for k in peaks[np.argsort(-evidence[peaks])[:PLACES]]]
     ends = [descended_alike(others, view, start) for start in starts]
     ends = [end if leaning(end, start, axis) < ASTRAY else start for start, end in zip(starts, ends, strict=True)]
     return ends[int(np.argmax([likelihood(others, view, p) for p in ends]))]
+
+
+def shrunk(view: View) -> View:
+    """The view, its pictures SHRUNK: a pattern that is laid on itself within a few degrees is not told by its finest detail."""
+    picture, mask, known = (smaller(a) for a in (view.rgb, view.mask, view.known))
+    return replace(view, camera=view.camera.resized(mask.shape[1], mask.shape[0]), rgb=picture, mask=mask, known=known)
+
+
+def shrunk_others(others: Others) -> Others:
+    """As `shrunk`; what they show of the mesh is left out."""
+    masks, channels = [smaller(m) for m in others.masks], [smaller(c) for c in others.channels]
+    cameras = [c.resized(m.shape[1], m.shape[0]) for c, m in zip(others.cameras, masks, strict=True)]
+    return replace(others, cameras=cameras, masks=masks, channels=channels, shown=[])
+
+
+def smaller(picture: np.ndarray) -> np.ndarray:
+    """(h / SHRUNK, w / SHRUNK, ...) of a picture (h, w, ...)."""
+    height, width = (max(1, round(side / SHRUNK)) for side in picture.shape[:2])
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def leaning(one: np.ndarray, other: np.ndarray, axis: Axis) -> float:
@@ -147,9 +167,10 @@ def correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> tuple[float
     return float(np.clip((weight * a * b).sum() / max(size, 1e-6), -0.99, 0.99)), float(weight.sum() / (np.pi * PATCH**2))
 
 
-def on_outline(mesh: Mesh, view: View, pose: np.ndarray) -> np.ndarray:
+def on_outline(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
     """The pose (4, 4) with which the mesh's outline lies on the view's mask where that is known; from one that is off by a few pixels."""
-    return follow_with_poses(mesh, [view.camera.with_pose(pose)], [view.mask], [view.known], OUTLINED, still=True)[1][0]
+    camera, scene = view.camera.with_pose(pose), others.scene
+    return follow_with_poses(others.mesh, [camera], [view.mask], [view.known], OUTLINED, still=True, scene=scene)[1][0]
 
 
 def descended_alike(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
@@ -163,7 +184,7 @@ def descended_alike(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
         near = [k + 1 for k in np.argsort(-cosines)[:NEIGHBOURS] if cosines[k] > np.cos(np.radians(ACROSS))]
         pairs = [(0, k, shown, others.masks[k - 1]) for k in near] + [(k, 0, others.shown[k - 1], mask) for k in near]
         shifts = shifts_between(others.mesh, others.scene, pairs, cameras, channels)
-        rows, _ = outline_rows(others.mesh, [camera], [view.mask], [view.known], LABELS)
+        rows, _ = outline_rows(others.mesh, [camera], [view.mask], [view.known], LABELS, others.scene)
         rows += [replace(r, poses=[one for one in r.poses if one[0][0] == 0]) for r in (texture_rows(shifts, cameras) if shifts else [])]
         camera = solved(others.mesh, [camera], rows, still=True)[1][0]
         if settled([before], [camera]):

@@ -43,8 +43,8 @@ class Board:
 
     def gains(self, cells: Cells) -> np.ndarray:
         """(T,) of the evidence, for every shift."""
-        count, total = self.count[cells.at], self.total[cells.at]
-        return (cells.weights * (self.evidence(count + 1, total + cells.values) - self.evidence(count, total))).sum(1)
+        count, total, before = self.count[cells.at], self.total[cells.at], self.evidence(self.count, self.total)
+        return (self.evidence(count + 1, total + cells.values) - before[cells.at]) @ cells.weights
 
     def best(self, seats: list[Cells]) -> tuple[float, int, int]:
         """Gain, seat and turn of a view's best place."""
