@@ -52,6 +52,22 @@ def test_use_device_says_what_is_missing(monkeypatch, tmp_path):
     assert caught.value.code == EXIT_ENVIRONMENT and "apt-get install" in caught.value.fix
 
 
+def test_a_gpu_that_traces_no_rays_is_left_alone(monkeypatch, tmp_path):
+    """As in a container that was given the computing half of the driver only."""
+    import drjit as dr
+
+    monkeypatch.setattr(dr, "has_backend", lambda backend: True)
+    monkeypatch.setenv("DRJIT_LIBOPTIX_PATH", str(tmp_path / "libnvoptix.so.1"))
+    assert device.use_device("auto") == "cpu"
+    with pytest.raises(UserError, match="traces no rays") as caught:
+        device.use_device("cuda")
+    assert caught.value.code == EXIT_ENVIRONMENT and "graphics" in caught.value.fix
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: name)
+    monkeypatch.setattr(doctor, "_output", lambda command: "a card, 580.1, 8192 MiB")
+    (check,) = doctor._cuda()
+    assert check.ok is None and "a card" in check.found and "without OptiX" in check.found
+
+
 @pytest.mark.parametrize(
     "program, said",
     [

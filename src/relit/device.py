@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import glob
 import os
 import signal
+import sys
 import threading
 from pathlib import Path
 
@@ -14,6 +16,7 @@ MIN_LLVM = 17  # older ones abort the process on x86-64 with AVX-512: "Cannot se
 LLVM_PATTERNS = ["/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*", "/usr/local/lib/libLLVM*.so*"]
 VARIANTS = {"cpu": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 LLVM_FIX = "sudo apt-get install -y libllvm19   (Debian, Ubuntu; libLLVM 17 or newer), or set DRJIT_LIBLLVM_PATH to the file"
+OPTIX_FIX = "in a container: NVIDIA_DRIVER_CAPABILITIES=compute,graphics,utility; elsewhere: sudo apt-get install -y libnvidia-gl-VERSION"
 
 
 def find_libllvm() -> str | None:
@@ -30,10 +33,21 @@ def _llvm_version(path: str) -> tuple[int, ...]:
     return tuple(int(x) for x in digits.split()) or (0,)
 
 
+def has_optix() -> bool:
+    """Is OptiX there, which comes with NVIDIA's driver? Without it a GPU computes but traces no rays, as in many containers."""
+    if sys.platform == "win32":
+        return True  # the driver keeps it where only its own search finds it
+    try:
+        ctypes.CDLL(os.environ.get("DRJIT_LIBOPTIX_PATH") or "libnvoptix.so.1")
+    except OSError:
+        return False
+    return True
+
+
 def use_device(device: str = "auto") -> str:
     """Set Mitsuba's variant for `device` ('auto', 'cpu', 'cuda') and return 'cpu' or 'cuda'.
 
-    Raises UserError (exit code 5) when the device is not there. 'auto' takes the GPU when there is one.
+    Raises UserError (exit code 5) when the device is not there. 'auto' takes the GPU when there is one that traces rays.
     """
     llvm = find_libllvm()
     if llvm:
@@ -51,7 +65,10 @@ def use_device(device: str = "auto") -> str:
             "install the driver, or run with --device cpu",
             code=EXIT_ENVIRONMENT,
         )
-    chosen = "cuda" if device == "cuda" or (device == "auto" and has_cuda) else "cpu"
+    if device == "cuda" and not has_optix():
+        why = "OptiX (libnvoptix.so.1), a part of NVIDIA's driver, is not there"
+        raise UserError("the GPU traces no rays", why, OPTIX_FIX, code=EXIT_ENVIRONMENT)
+    chosen = "cuda" if device == "cuda" or (device == "auto" and has_cuda and has_optix()) else "cpu"
     if chosen == "cpu" and not (llvm and dr.has_backend(dr.JitBackend.LLVM)):
         why = f"Relit compiles its kernels with it on the CPU; it is not in any wheel; version {MIN_LLVM} or newer is needed"
         raise UserError("no usable libLLVM was found", why, LLVM_FIX, code=EXIT_ENVIRONMENT)

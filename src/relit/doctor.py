@@ -16,7 +16,7 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from relit.device import LLVM_FIX, LLVM_PATTERNS, MIN_LLVM, find_libllvm
+from relit.device import LLVM_FIX, LLVM_PATTERNS, MIN_LLVM, OPTIX_FIX, find_libllvm, has_optix
 from relit.errors import EXIT_ENVIRONMENT, EXIT_OK
 from relit.log import available_memory, readable_bytes
 
@@ -149,7 +149,10 @@ def _cuda() -> list[Check]:
     query = _output([smi, "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"])
     if not query:
         return [Check("CUDA", None, "nvidia-smi is there but answers nothing; the CPU is used", "nvidia-smi")]
-    return [Check("CUDA", True, "; ".join(query.splitlines()))]
+    found = "; ".join(query.splitlines())
+    if not has_optix():
+        return [Check("CUDA", None, f"{found}, without OptiX (libnvoptix.so.1), which traces rays; the CPU is used", OPTIX_FIX)]
+    return [Check("CUDA", True, found)]
 
 
 def _gradient(device: str) -> Check:
