@@ -29,15 +29,14 @@ def run_suite(
     assets: str | Path | None = None,
     objects: Sequence[str] = (),
     out: str | Path | None = None,
-    spp: int | None = None,
+    spp: int = 256,
     seed: int = 0,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Synthesize, reconstruct and evaluate every object of a suite, plain and with each ablation.
 
     assets: folder with `assets` and `envmaps`. objects: names to limit the suite to. ablate: names of the suite's ablations or `key=value`.
-    out: folder for the runs and the results, by default a new one in the cache. spp: samples a pixel when the
-    result is rendered, by default what `relit evaluate` takes.
+    out: folder for the runs and the results, by default a new one in the cache. spp: samples a pixel when the result is rendered.
     Returns {"suite", "quality", "device", "machine", "runs": {variant: {object: {"metrics", ...}}}, "means": {variant: {figure: value}}}.
     """
     from relit.device import use_device
@@ -69,7 +68,7 @@ def run_suite(
             say(f"{name} ({variant}): {' '.join(command[1:])}")
             seconds, memory = timed(command, folder / "logs" / f"{run.name}.txt")
             say(f"{name} ({variant}): {seconds:.0f} s, {memory:.2f} GB; evaluating")
-            entry = evaluate(run, capture, **({} if spp is None else {"spp": spp}))
+            entry = evaluate(run, capture, spp=spp)
             costs = entries({"seconds": seconds, "peak_memory": memory}, COST_DEFINITIONS)
             entry["metrics"] = {**costs, **entry["metrics"]}
             result["runs"][variant][name] = {**entry, "run": run.name, "capture": capture.name}
