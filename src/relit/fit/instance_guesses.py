@@ -9,7 +9,7 @@ import numpy as np
 from relit.fit.instance_growth import ANOTHER, seen_from
 from relit.fit.instance_options import COLOURFUL, DETAILED, Search
 from relit.fit.instances import View, albedo_render, first_pose, fit_model, inflated
-from relit.fit.register import Gallery, crop_rings, directions_around, rings_of, search, views_from
+from relit.fit.register import crop_rings, directions_around, make_galleries, search, views_from
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,8 @@ def pair_guesses(views: list[View], crops, chosen: list[int], o: Search, distanc
         model, _ = fit_model([views[k]], pose[None], inflated(views[k], pose, o.nodes), o.steps, seed=seed)
         close = directions @ seen_from(pose[None])[0] >= np.cos(np.radians(o.cone))
         cameras = views_from(directions[close], max(2.0, distance))
-        rgb, alpha = albedo_render(model)(cameras)
-        for parts, guesses in out.items():
-            gallery = Gallery(cameras, rings_of(rgb, alpha, parts=parts))
+        galleries = make_galleries(albedo_render(model), cameras, out)
+        for gallery, (parts, guesses) in zip(galleries, out.items(), strict=True):
             found = search(crops, gallery, keep=o.keep, rings=rings[parts], apart=ANOTHER)
             guesses.poses[s], guesses.scores[s] = found.poses, found.scores
             guesses.poses[s, k], guesses.scores[s, k] = pose, -1.0

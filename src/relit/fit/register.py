@@ -175,8 +175,13 @@ def views_from(directions: np.ndarray, distance: float = 3.0, side: int = SIDE) 
 
 def make_gallery(render: Render, cameras: list[Camera], parts=PARTS) -> Gallery:
     """Render the views. Views that see next to nothing never match."""
+    return make_galleries(render, cameras, (parts,))[0]
+
+
+def make_galleries(render: Render, cameras: list[Camera], several) -> list[Gallery]:
+    """The same views, rendered once, as each of several weights (see PARTS) describes them."""
     rgb, alpha = render(cameras)
-    return Gallery(cameras, rings_of(rgb, alpha, parts=parts))
+    return [Gallery(cameras, rings_of(rgb, alpha, parts=parts)) for parts in several]
 
 
 # ---------------------------------------------------------------- what is compared

@@ -21,7 +21,7 @@ from relit.fit.instance_options import DETAILED
 from relit.fit.instances import View, albedo_render, crops_of, move_poses, moved_poses, overlaps, pixel_bank
 from relit.fit.loop import NoStage
 from relit.fit.odd_instances import view_errors
-from relit.fit.register import Gallery, crop_rings, directions_around, refine, rings_of, views_from, volume_render
+from relit.fit.register import Gallery, crop_rings, directions_around, make_galleries, refine, views_from, volume_render
 from relit.fit.revolution import UP
 from relit.fit.turn_guess import all_turns
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume
@@ -98,9 +98,7 @@ def where_outlines_agree(errors: np.ndarray, view: View, poses: np.ndarray, mode
 
 def galleries_of(model: VolumeModel, distance: float, seed: int) -> list[Gallery]:
     """The model seen from all sides, from a distance, as each of PLACED describes it. They serve all who are sought."""
-    cameras = views_from(directions_around(VIEWPOINTS, seed), distance)
-    rgb, alpha = albedo_render(model)(cameras)
-    return [Gallery(cameras, rings_of(rgb, alpha, parts=parts)) for parts in PLACED]
+    return make_galleries(albedo_render(model), views_from(directions_around(VIEWPOINTS, seed), distance), PLACED)
 
 
 def candidates(view: View, model: VolumeModel, galleries: list[Gallery]) -> np.ndarray:
