@@ -58,15 +58,18 @@ def vessel_of(
     flat, ends = ends_of(values, axis, views, cameras)
     o = replace(options, steps=min(STEPS, options.steps // 2), **TRIAL)
     best, stage = flat, NoStage(progress)
+    shape, closed, fitted = flat, None, False  # what an end is asked of: as `best`, with the floor of a hollow where one of FLOORS has it
     for end in mouths(flat, axis, ends):
-        hollows = [hollowed(values, best, axis, end, raised) for raised in FLOORS]
+        hollows = [hollowed(values, shape, axis, end, raised) for raised in FLOORS]
         if any(h is None for h in hollows):
             continue
-        closed = Body.of(best, lit, o)
+        closed = closed or Body.of(shape, lit, o)
         lid = closed.texels_of(lid_of(closed.mesh, axis, end, 2 / (len(values) - 1)))
         if met_by(closed, lid, o, seed) < PIXELS:
             continue
-        closed.fit(o, stage, seed)
+        if not fitted:
+            closed.fit(o, stage, seed)
+            fitted = True
         changes: list[float] = []
         for trial in hollows:
             opened = Body.of(trial, lit, o)
@@ -74,9 +77,12 @@ def vessel_of(
             changes.append(change_of_error(closed, opened, lid, o, seed))
             if changes[0] > 1 - GAIN:
                 break
+            if changes[-1] == min(changes):
+                likeliest = trial, opened
         else:
             say(f"the object is hollow under one end: the error of the photos there falls to {min(changes):.0%}")
             best = hollowed(values, best, axis, end, lowest_of(changes))
+            shape, closed = likeliest
     return redistance(best) if (best > values).any() else None
 
 
