@@ -1,6 +1,7 @@
 """Ends of bodies of revolution: cut off where no silhouette needs them, and opened where the light says that they are mouths."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from relit.capture.procedural import studio
 from relit.capture.synthetic_duplicates import synthesize_duplicates
 from relit.conventions import scale_of
 from relit.fit import duplicates_shape as shape
+from relit.fit import vessel_trial
 from relit.fit.duplicates_poses import all_views
 from relit.fit.instances import View
+from relit.fit.surface import SurfaceOptions
 from relit.fit.vessel_trial import FLOORS, lowest_of
 from relit.fit.vessels import End, body_axis, ends_of, floor_under, hollowed, mouths
 from relit.geometry.hull import distance_of
@@ -170,3 +173,40 @@ def test_light_tells_a_cup_from_a_plug(tmp_path, monkeypatch):
     assert "hollow" not in silent and (plug[(np.hypot(P[..., 0], P[..., 2]) / same < 0.3) & (np.abs(P[..., 1]) / same < 0.25)] < 0).all()
     for found, s in ((cup, scale), (plug, same)):  # the cone is gone from either
         assert not (found[P[..., 1] / s > TOP + 0.1] < 0).any()
+
+
+def test_the_second_end_is_asked_of_the_fit_with_the_first_hollow(monkeypatch):
+    """A fit takes long: five for two ends, one of them a mouth, and the other one is compared with the likeliest hollow of the first."""
+    fitted, compared = [], []
+
+    class Fake(SimpleNamespace):
+        def fit(self, *_):
+            fitted.append(self.name)
+
+        def texels_of(self, faces):
+            return faces
+
+    def change(closed, opened, *_):
+        compared.append((closed.name, opened.name))
+        return {"mouth 0.0": 0.5, "mouth 0.2": 0.3, "mouth 0.4": 0.6}.get(opened.name, 0.95)
+
+    replaced = {
+        "extract_mesh": lambda *_, **__: None,
+        "body_axis": lambda mesh: UP,
+        "ends_of": lambda values, *_: (np.full_like(values, 0.0), None),
+        "mouths": lambda *_: ["mouth", "foot"],
+        "hollowed": lambda values, shape, axis, end, raised: np.full(values.shape, f"{end} {raised}".startswith("mouth") * (1 + raised)),
+        "lid_of": lambda *_: None,
+        "met_by": lambda *_: vessel_trial.PIXELS,
+        "change_of_error": change,
+        "redistance": lambda values: values,
+    }
+    for name, by in replaced.items():
+        monkeypatch.setattr(vessel_trial, name, by)
+    names = iter(["flat", "mouth 0.0", "mouth 0.2", "mouth 0.4", "foot 0.0"])
+    monkeypatch.setattr(vessel_trial.Body, "of", staticmethod(lambda *_: Fake(mesh=None, name=next(names))))
+    said = []
+    found = vessel_trial.vessel_of(np.full((2, 2, 2), -1.0), [], [], None, SurfaceOptions(), said.append)
+    assert fitted == ["flat", "mouth 0.0", "mouth 0.2", "mouth 0.4", "foot 0.0"]
+    assert compared == [("flat", "mouth 0.0"), ("flat", "mouth 0.2"), ("flat", "mouth 0.4"), ("mouth 0.2", "foot 0.0")]
+    assert len(said) == 1 and np.allclose(found, 1 + lowest_of([0.5, 0.3, 0.6]))
