@@ -65,10 +65,11 @@ def use_device(device: str = "auto") -> str:
             "install the driver, or run with --device cpu",
             code=EXIT_ENVIRONMENT,
         )
-    if device == "cuda" and not has_optix():
+    traces = device != "cpu" and has_cuda and has_optix()
+    if device == "cuda" and not traces:
         why = "OptiX (libnvoptix.so.1), a part of NVIDIA's driver, is not there"
         raise UserError("the GPU traces no rays", why, OPTIX_FIX, code=EXIT_ENVIRONMENT)
-    chosen = "cuda" if device == "cuda" or (device == "auto" and has_cuda and has_optix()) else "cpu"
+    chosen = "cuda" if traces else "cpu"
     if chosen == "cpu" and not (llvm and dr.has_backend(dr.JitBackend.LLVM)):
         why = f"Relit compiles its kernels with it on the CPU; it is not in any wheel; version {MIN_LLVM} or newer is needed"
         raise UserError("no usable libLLVM was found", why, LLVM_FIX, code=EXIT_ENVIRONMENT)

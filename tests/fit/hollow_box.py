@@ -34,9 +34,6 @@ def pictures(inside):
     """Photos of a shape, striped inside and out: (rgb, coverage) of each camera."""
     import mitsuba as mi
 
-    from relit.device import use_device
-
-    use_device("cpu")
     from relit.fit.register import volume_render
     from relit.fit.volume import start_model
 

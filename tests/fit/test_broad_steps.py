@@ -11,10 +11,8 @@ SIZE = 32
 @pytest.fixture(scope="module")
 def sheet():
     """A flat grid of 17 x 17 vertices, its uvs all over the texture."""
-    from relit.device import use_device
     from relit.scene import Mesh
 
-    use_device("cpu")
     u, v = np.meshgrid(np.linspace(0, 1, 17), np.linspace(0, 1, 17))
     vertices = np.stack([u.ravel(), v.ravel(), 0 * u.ravel()], 1).astype(np.float32)
     i = (np.arange(16)[:, None] * 17 + np.arange(16)).ravel()

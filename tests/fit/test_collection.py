@@ -32,10 +32,8 @@ def capture(tmp_path_factory):
 
     from relit.asset.gltf import write_glb
     from relit.capture.synthetic_collection import synthesize_collection
-    from relit.device import use_device
     from relit.images import write_linear
 
-    use_device("cpu")
     folder = tmp_path_factory.mktemp("collection")
     write_glb(folder / "lump.glb", *lump())
     light = np.full((8, 16, 3), 0.4, np.float32)
@@ -106,9 +104,7 @@ def test_posterior_silences_what_is_out_of_line():
 
 
 def test_scale_is_exchanged_without_a_change_of_what_is_diffuse():
-    from relit.device import use_device
 
-    use_device("cpu")
     from relit.fit.collection_surface import exchange_scale
     from relit.fit.loop import Adam
     from relit.materials.field import start_material
@@ -261,9 +257,6 @@ def test_the_surface_pass_takes_the_network_and_the_first_colours(tmp_path):
     import sys
     from pathlib import Path
 
-    from relit.device import use_device
-
-    use_device("cpu")
     sys.path.insert(0, str(Path(__file__).parents[1] / "lighting"))
     from lump import lump
     from test_neural_pil import write_network

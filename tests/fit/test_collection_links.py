@@ -8,13 +8,6 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def device():
-    from relit.device import use_device
-
-    use_device("cpu")
-
-
 def texture_ball(direction, side=220, field=1.1):
     """(rgb, mask, world_from_camera, focal): a ball with a fine pattern, seen from `direction` at distance 3. field: focal
     length over side."""

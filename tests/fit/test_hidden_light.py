@@ -16,13 +16,6 @@ SKY = 0.5  # radiance from everywhere
 BASE = 0.6
 
 
-@pytest.fixture(scope="module", autouse=True)
-def device():
-    from relit.device import use_device
-
-    use_device("cpu")
-
-
 def mesh_of(*parts) -> Mesh:
     """Of (trimesh, whether it has texels)."""
     vertices = np.concatenate([p.vertices for p, _ in parts])

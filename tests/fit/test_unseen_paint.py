@@ -15,11 +15,9 @@ def ball():
     import trimesh
 
     from relit.cameras.se3 import look_at
-    from relit.device import use_device
     from relit.geometry.atlas import unwrap
     from relit.scene import Mesh
 
-    use_device("cpu")
     shape = trimesh.creation.icosphere(4, 0.6)
     v = np.asarray(shape.vertices, np.float32)
     mesh, _ = unwrap(Mesh(v, np.asarray(shape.faces, np.int32), v / 0.6), SIZE)

@@ -11,9 +11,6 @@ def volume_lump():
     """A lump with three arms of different lengths and a colour that changes all over it."""
     import mitsuba as mi
 
-    from relit.device import use_device
-
-    use_device("cpu")
     from relit.fit.volume import start_model
 
     n = 40

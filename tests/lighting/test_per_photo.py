@@ -4,13 +4,6 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def device():
-    from relit.device import use_device
-
-    use_device("cpu")
-
-
 def lights(count=3):
     from relit.lighting.per_photo import PhotoLights, light_prior, log_lights
 

@@ -81,8 +81,9 @@ def vessel_of(
                 likeliest = trial, opened
         else:
             say(f"the object is hollow under one end: the error of the photos there falls to {min(changes):.0%}")
-            best = hollowed(values, best, axis, end, lowest_of(changes))
             shape, closed = likeliest
+            deepened = hollowed(values, best, axis, end, lowest_of(changes))
+            best = shape if deepened is None else deepened  # None: where another hollow lies deeper than in what was asked
     return redistance(best) if (best > values).any() else None
 
 
