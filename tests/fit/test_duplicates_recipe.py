@@ -22,8 +22,8 @@ from relit.evaluate.protocols import evaluate
 from relit.fit import duplicates as recipe
 from relit.fit import duplicates_poses as poses_stage
 from relit.fit import duplicates_shape as shape
+from relit.fit import found_again, pose_passes
 from relit.fit import odd_instances as odd
-from relit.fit import pose_passes
 from relit.geometry.sdf import node_positions
 from relit.images import write_linear
 from relit.run import Run
@@ -220,10 +220,9 @@ def test_the_shape_is_built_again_where_the_poses_are_now(pile, tmp_path):
     assert beside(poses) < 0.1 and beside(wrong) > 0.3
 
 
-def test_odd_instances_are_few_among_many(monkeypatch):
+def test_odd_instances_are_few_among_many():
     def found(errors):
-        monkeypatch.setattr(odd, "view_errors", lambda *_: np.array(errors))
-        return np.flatnonzero(odd.odd_instances(SimpleNamespace(views=len(errors)), None)).tolist()
+        return np.flatnonzero(odd.odd_instances(np.array(errors))).tolist()
 
     assert found([1, 1.2, 0.9, 1.7, 1.1, 6.3, 1, 1]) == [5]
     assert found([1, 1.2, 0.9, 1.7, 1.1, 1.6, 1, 1]) == []
@@ -236,12 +235,12 @@ def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile))
     calls = []
 
-    def third(bank, model, seed=0):
-        calls.append(bank.views)
-        return np.arange(bank.views) == 2
+    def third(errors):
+        calls.append(len(errors))
+        return np.arange(len(errors)) == 2
 
     monkeypatch.setattr(pose_passes, "odd_instances", third)
-    monkeypatch.setattr(shape, "sought_again", lambda *_: (None, False))
+    monkeypatch.setattr(found_again, "sought_again", lambda *_, **__: (None, False))
     capture, options = open_capture(pile), small_options(level_steps=(12,))
     with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
         asset = recipe.reconstruct(capture, run, options, 0)
@@ -256,6 +255,25 @@ def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
     assert "does not agree with the model of all" in (run.folder / "log.txt").read_text()
 
 
+def told_passes(monkeypatch, asked: list, *told: dict):
+    """What `joint_stages` makes of passes that turn all by a degree, are as `told` (fields of Pass), and say that b is odd."""
+    asked.clear()
+
+    def stage(views, poses, number, run, options, seed, last, seek, final):
+        names = [v.key for v in views]
+        asked.append("".join(names) + ("?" + "".join(v.key for v in seek()) if seek else "") + "." * final)
+        assert (last and last.symmetry) == (number or None)  # the pass before
+        odd = np.array([name == "b" for name in names])
+        fields = {"errors": np.ones(len(names)), "turn": 2.0, "off": 3.0, **told[number]}
+        return pose_passes.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, symmetry=number + 1, **fields)
+
+    monkeypatch.setattr(pose_passes, "joint_stage", stage)
+    some = [SimpleNamespace(key=name) for name in "abcde"]
+    say = SimpleNamespace(say=lambda text: asked.append(text))
+    views, *rest = pose_passes.joint_stages(some[:3], np.zeros((3, 4, 4)), some[3:], lambda left: left, say, None, 0)
+    return "".join(v.key for v in views), *rest
+
+
 def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     """Who is left out of one pass is not in the next; at most PASSES are made. Poses that textures had to lead back are to stay then."""
     asked = []
@@ -263,22 +281,12 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     def passes(*told: tuple):
         """(poses, odd, arrived, the last pass), asked for passes which turn all by so many degrees, and leave textures so far off; and
         whether some were half a turn off then."""
-        asked.clear()
+        names = ("turn", "off", "mixed")
+        return told_passes(monkeypatch, asked, *(dict(zip(names, one, strict=False)) for one in told))[1:]
 
-        def stage(views, poses, number, run, options, seed, last):
-            asked.append(list(views))
-            assert (last and last.symmetry) == (number or None)  # the pass before
-            odd = np.array([v == "b" for v in views])
-            turn, off, *mixed = told[number]
-            return pose_passes.Pass(poses + np.where(odd, 0, 1)[:, None, None], odd, turn, off, number + 1, *mixed)
-
-        monkeypatch.setattr(pose_passes, "joint_stage", stage)
-        return pose_passes.joint_stages(["a", "b", "c"], start, None, None, 0)
-
-    start = np.zeros((3, 4, 4))
     poses, odd, arrived, last = passes((2, 3.0), (2, 2.0), (0.1, 1.5))
-    assert asked == [["a", "b", "c"], ["a", "c"], ["a", "c"]]
-    assert odd.tolist() == [False, True, False] and poses[:, 0, 0].tolist() == [3, 0, 3] and not start.any()
+    assert asked == ["abc?de", "ac?de", "ac?de"]
+    assert odd.tolist() == [False, True, False] and poses[:, 0, 0].tolist() == [3, 0, 3]
     assert arrived and last.symmetry == 3 and not last.exact
     assert not passes((2, 3.0), (2, None))[2] and len(asked) == 2, "labels and textures agree"
     _, _, arrived, last = passes((2, 3.0), (2, 0.2))
@@ -286,6 +294,62 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     assert passes((2, 0.6), (2, 0.55))[2] and len(asked) == 2, "textures come no closer"
     assert passes((0.1, 0.2, True), (2, 0.3), (2, 0.2))[2] and len(asked) == 3, "what was mixed tells nothing of what follows"
     assert not passes((2, 3.0), (2, 2.0), (2, 1.0), (2, 0.5))[2] and len(asked) == pose_passes.PASSES, "still on their way"
+
+
+def test_who_is_found_in_the_last_pass_takes_part_in_more(monkeypatch):
+    asked, there, also = [], {"e": np.full((4, 4), 7.0)}, {"d": np.full((4, 4), 5.0)}
+    views, poses, odd, arrived, last = told_passes(monkeypatch, asked, {"off": None, "found": there}, {"off": 2.0}, {"off": 0.2})
+    assert asked == ["abc?de", "ace?d", "ace?d"] and views == "abce"
+    assert poses[:, 0, 0].tolist() == [3, 0, 3, 9] and odd.tolist() == [False, True, False, False] and arrived and last.symmetry == 3
+    views, poses, *_ = told_passes(monkeypatch, asked, {"off": 0.2, "found": there}, {"off": 0.2, "found": also}, {"off": 0.2})
+    assert asked == ["abc?de", "ace?d", "aced"] and views == "abced" and poses[:, 0, 0].tolist() == [3, 0, 3, 9, 6]
+    for errors, stays in ((1.05, True), (1.2, False)):
+        after = {"off": None, "errors": np.array([errors, errors, 5.0 - 4 * errors])}
+        views, poses, odd, arrived, last = told_passes(monkeypatch, asked, {"off": 0.2, "found": there}, after)
+        assert views == ("abce" if stays else "abc") and len(odd) == len(poses) == len(views)
+        assert (arrived, last.symmetry, poses[0, 0, 0]) == ((False, 2, 2) if stays else (True, 1, 1))
+        assert asked[2:] == ([] if stays else ["the others agree less for it: all is as it was before"])
+    ways = [{"off": 4000 * 0.5**k} for k in range(8)]
+    ways[3]["found"] = there
+    assert told_passes(monkeypatch, asked, *ways)[0] == "abce", "still on their way"
+    assert asked == ["abc?de", *["ac?de"] * 2, "ac?de.", *["ace?d"] * 3, "ace."], "nobody is sought where no pass would follow"
+
+
+def test_a_pass_is_kept_whole():
+    one = pose_passes.Pass(np.ones((2, 4, 4)), np.array([True, False]), np.array([0.1, 0.2]), 1.5, None, None, True, {7: np.eye(4)})
+    again = pose_passes.pass_from(one.arrays)
+    assert again.off is None and again.symmetry is None and again.mixed and again.turn == 1.5
+    assert np.array_equal(again.errors, one.errors) and np.array_equal(again.odd, one.odd) and list(again.found) == [7]
+    assert np.array_equal(again.found[7], np.eye(4)) and not pose_passes.pass_from(replace(one, found={}).arrays).found
+
+
+def test_who_joins_is_sought_where_few_are_left_out(monkeypatch):
+    asked, said = [], []
+
+    def sought(view, *, guess):
+        asked.append(view.key)
+        return {1: (np.eye(4), True), 2: (np.eye(4), False), 3: (None, False)}[view.key]
+
+    def joined(count, *keys, axis=None, without=()):
+        asked.clear()
+        monkeypatch.setattr(found_again, "seeker", lambda *_: sought)
+        monkeypatch.setattr(found_again, "body_axis", lambda mesh: axis)
+        monkeypatch.setattr(found_again, "extract_mesh", lambda values: None)
+        monkeypatch.setattr(found_again, "dense_values", lambda grid: None)
+        others = [SimpleNamespace(key=k, label=k, photo=0) for k in keys]
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, 0, 3] = np.arange(count)
+        after = poses + np.eye(4)[3] * np.array([[2.0], [0], [0], [0]])
+        options = replace(recipe.options_for("standard"), without=without)
+        how = {"run": SimpleNamespace(say=said.append), "options": options, "seed": 0}
+        return found_again.joiners(others, ["a view"] * count, poses, after, SimpleNamespace(grid=None), None, **how)
+
+    found = joined(12, 1, 2, 3)
+    assert asked == [1, 2, 3] and list(found) == [1, 2] and found[1][0, 3] == 2, "in the frame that poses have after the pass"
+    assert "label 1 was found" in said[0] and "label 2 may have been found" in said[1]
+    for few in ((7, 1), (9, 1, 2, 3), (20, 1)):  # too few tell who is odd; so many could not be told; so many need nobody
+        assert joined(*few) == {} and asked == []
+    assert joined(12, 1, axis="an axis") == {} and joined(12, 1, without=("search",)) == {} and asked == []
 
 
 def test_two_photos_of_one_pile(tmp_path, monkeypatch):

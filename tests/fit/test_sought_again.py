@@ -13,7 +13,7 @@ from volume_lump import photos_of, volume_lump
 from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
 from relit.fit import sought_again as module
-from relit.fit.duplicates_shape import carried
+from relit.fit.found_again import carried
 from relit.fit.instances import View, overlaps, pixel_bank
 from relit.fit.odd_instances import view_errors
 from relit.fit.register import volume_render
@@ -115,6 +115,32 @@ def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
     monkeypatch.setattr(module, "candidates", lambda *_: poses[[1, 0]])
     assert np.array_equal(found([[20.0, 30.0], [3.0, 30.0]]), poses[1]) and asked == [5, 6]
     assert found([[20.0, 30.0]] * 3) is None and asked == [5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    "first, then, taken, rounds",
+    [
+        ([20.0, 30.0], [11.0, 14.0], True, 1),  # nearly
+        ([20.0, 30.0], [18.0, 30.0], True, 1),  # it leads clearly
+        ([20.0, 30.0], [18.0, 26.0], False, 3),  # it does not
+        ([30.0, 60.0], [22.0, 60.0], False, 3),  # it leads, but too far off
+        ([20.0, 30.0], [7.0, 30.0], True, 1),  # certain by then
+    ],
+)
+def test_the_best_places_are_looked_into_where_none_is_certain(lump, monkeypatch, first, then, taken, rounds):
+    _, (guide, hidden), poses = lump
+    asked = []
+
+    def descended(view, guide, guide_pose, tried, model, turns, steps, seed):
+        asked.append((steps, len(tried)))
+        return tried, np.array([*first, first[1] + 1, 90.0] if steps == module.STEPS else then)
+
+    turned = turned_about(poses[1], 0.1)  # of one place the better descent counts
+    monkeypatch.setattr(module, "candidates", lambda *_: np.stack([poses[1], poses[0], turned_about(poses[0], 0.1), turned]))
+    monkeypatch.setattr(module, "descended", descended)
+    pose, sure = sought_again(hidden, guide, poses[0], None, 1.0, None, none, 5, guess=True)
+    assert asked == [(module.STEPS, 4), (module.LONGER, 2)] * rounds and sure == (then[0] < module.AGREES)
+    assert pose is None if not taken else np.array_equal(pose, poses[1])
 
 
 def test_of_one_whose_axis_is_known_all_turns_are_tried_and_the_best_is_taken(lump, monkeypatch):

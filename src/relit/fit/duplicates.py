@@ -3,8 +3,9 @@
     poses     a virtual camera for each instance; matching, and search by rendering      fit/duplicates_poses.py, fit/instance_search.py
     photos    of several photos of one pile how they stand to each other                 fit/pile_photos.py
     joint     one signed distance field in the object's frame, moves with the poses; odd ones are left out    fit/pose_passes.py
+              who was not placed, and is found in their model, takes part in more     fit/found_again.py
     vessel    ends of a body of revolution: cut off square, and hollow where light says so    fit/vessels.py, fit/vessel_trial.py
-    volume    the same once more, from those poses; who was left out is sought in it          fit/sought_again.py, fit/turn_guess.py
+    volume    the same once more, from those poses; who was left out is sought in it          fit/found_again.py, fit/turn_guess.py
     mesh       zero level set, decimated; mesh and poses as outlines and textures are; texture atlas; the ground      fit/joint_alignment.py
     surface    one material for all instances and one environment, light traced past all instances and the ground     fit/surface.py
     turns      about the axis of a body of revolution, where they were guessed: as the photo shows them       fit/turns_as_shown.py

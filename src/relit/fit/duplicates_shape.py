@@ -5,28 +5,23 @@ found again, the mesh, and the ground that they stand on. For the recipe `duplic
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 
-import mitsuba as mi
 import numpy as np
 
-from relit.cameras.se3 import nearest_rotation
-from relit.conventions import similarity
 from relit.fit.duplicates_options import DuplicatesOptions
-from relit.fit.duplicates_poses import Shot, named
+from relit.fit.duplicates_poses import Shot
+from relit.fit.found_again import carried, joiners, with_found
 from relit.fit.instances import View
 from relit.fit.lit_pile import LitPile, lit_pile, surface_options
 from relit.fit.loop import NoStage
 from relit.fit.mirrored import Symmetry
-from relit.fit.odd_instances import view_errors
 from relit.fit.pile_photos import Scene
 from relit.fit.pile_scene import distance_in, find_ground, set_down
-from relit.fit.pixels import PixelBank
 from relit.fit.pose_passes import (
     JOINT,
     followed,
     joint_stages,
-    light_turns,
     motion_or_none,
     placed_by_outlines,
     pose_rate,
@@ -34,11 +29,8 @@ from relit.fit.pose_passes import (
     shape_and_poses,
 )
 from relit.fit.round_bodies import made_round
-from relit.fit.sought_again import galleries_of, sought_again
-from relit.fit.turn_guess import others_of, turned_alike
 from relit.fit.vessel_trial import vessel_of
 from relit.fit.vessels import body_axis
-from relit.fit.volume import VolumeModel
 from relit.geometry.atlas import unwrap
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, redistance, resample, row_features
@@ -143,18 +135,21 @@ def volume_stage(
     arrived, symmetry, vessel, follow, vague = False, None, None, None, []
     before = {v.key: p for v, p in zip(views, poses, strict=True)}
     if pose_rate(views, options) > 0:
-        poses, odd, arrived, last = joint_stages(views, poses, run, options, seed)
+        seek = partial(joiners, run=run, options=options, seed=seed)
+        views, poses, odd, arrived, last = joint_stages(views, poses, others, seek, run, options, seed)
         symmetry, follow = last.symmetry, followed
         if arrived:  # outlines and textures have had their say by the shape of the pass before; where they agree, this one may follow both
             follow = placed_by_outlines if last.exact else None
-        others = [*others, *(views[k] for k in np.flatnonzero(odd))]
+        within = {v.key for v in views}
+        others = [*(v for v in others if v.key not in within), *(views[k] for k in np.flatnonzero(odd))]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
         vessel = vessel_stage(shots, views, poses, symmetry, run, options, seed)
     steps = sum(options.level_steps) if vessel is None else sum(options.level_steps[1:])
     with run.stage("volume", steps=steps, title="shape and poses (volume pass)") as stage:
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still=arrived, vessel=vessel)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
-            on_axes = carried(on_axes, np.array([before[v.key] for v in views]), poses)
+            stayed = np.array([v.key in before for v in views])
+            on_axes = carried(on_axes, np.array([before[v.key] for v in views if v.key in before]), poses[stayed])
             views, poses, vague = with_found(views, poses, others, on_axes, model, bank, run, seed)
         return views, poses, model, follow, vague
 
@@ -192,45 +187,3 @@ def built_again(views: list[View], poses: np.ndarray, symmetry: Symmetry | None,
     coarse = replace(options, levels=options.levels[:2], level_steps=options.level_steps[:2])
     model, _, _ = shape_and_poses(views, poses, run, NoStage(), coarse, seed, symmetry, still=True)
     return redistance(dense_values(model.grid))
-
-
-def carried(some: dict[int, np.ndarray], before: np.ndarray, after: np.ndarray) -> dict[int, np.ndarray]:
-    """Poses of the object's frame before passes that have moved it, in that after them: by the similarity that those (N, 4, 4) tell which
-    have gone along."""
-    turn = nearest_rotation(np.sum(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1), 0))
-    far = [np.linalg.norm(p[:, :3, 3] - p[:, :3, 3].mean(0), axis=1).mean() for p in (before, after)]
-    scale = far[1] / far[0] if len(before) > 1 and far[0] > 0 else 1.0
-    shift = np.median(after[:, :3, 3] - scale * before[:, :3, 3] @ turn.T, axis=0)
-    return {k: similarity(turn @ p[:3, :3], scale * turn @ p[:3, 3] + shift) for k, p in some.items()}
-
-
-def with_found(
-    views: list[View], poses: np.ndarray, others: list[View], on_axes: dict[int, np.ndarray], model: VolumeModel, bank: PixelBank, run, seed
-):
-    """(views, poses, vague: see `volume_stage`) with those of `others` that are found in the model, which gets their entries."""
-    level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
-    turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
-    mesh = extract_mesh(dense_values(model.grid))
-    galleries = lru_cache(1)(partial(galleries_of, model, float(np.linalg.norm(poses[0][:3, 3]))))  # they are large
-    found, vague, turned = [], [], turned_by_others(mesh, views, poses)
-    for view in others:
-        pose, sure = sought_again(view, views[0], poses[0], model, level, turns, galleries, seed, on_axes.get(view.key), turned)
-        if pose is not None and not sure:
-            run.say(f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess")
-        else:
-            run.say(f"the object with {named(view)} was {'' if sure else 'not '}found in the finished model of the others")
-        if pose is not None:
-            (found if sure else vague).append((view, pose))
-    count = len(found) + len(vague)
-    model.reflections = mi.Float(np.concatenate([np.array(model.reflections), np.zeros(4 * count, np.float32)]))
-    return [*views, *(v for v, _ in found)], np.concatenate([poses, *(p[None] for _, p in found)]), vague
-
-
-def turned_by_others(mesh: Mesh, views: list[View], poses: np.ndarray):
-    """What turns another view's pose about the axis of a body of revolution, as `sought_again` asks for it, by what `views` show; the pose
-    as it is where they show no texture, and None where the mesh is no such body."""
-    axis = body_axis(mesh)
-    if axis is None:
-        return None
-    others = others_of(mesh, views, poses)
-    return (lambda _, pose: pose) if others is None else (lambda view, pose: turned_alike(others, view, pose, axis))

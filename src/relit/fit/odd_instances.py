@@ -19,11 +19,10 @@ MOST = 0.2  # of the instances can be odd
 PROBES = 200_000  # rays
 
 
-def odd_instances(bank: PixelBank, model: VolumeModel, seed: int = 0) -> np.ndarray:
-    """(views,) bool: whose whole pixels have more than ODD times the median squared error; none where that were more than MOST of all."""
-    error = view_errors(bank, model, seed)
-    odd = error > ODD * np.nanmedian(error)
-    return odd if bank.views >= LEAST and odd.mean() <= MOST else np.zeros_like(odd)
+def odd_instances(errors: np.ndarray) -> np.ndarray:
+    """(N,) bool: whose error (see `view_errors`) is more than ODD times the median; none where that were more than MOST of all."""
+    odd = errors > ODD * np.nanmedian(errors)
+    return odd if len(errors) >= LEAST and odd.mean() <= MOST else np.zeros_like(odd)
 
 
 def view_errors(bank: PixelBank, model: VolumeModel, seed: int = 0) -> np.ndarray:

@@ -4,7 +4,8 @@ another, and what the last one shares with them. For the recipe `duplicates`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import mitsuba as mi
@@ -19,9 +20,10 @@ from relit.fit.instance_turns import coherent_turns
 from relit.fit.instances import View, carved, crops_of, hold_distances, move_poses, moved_poses, pixel_bank
 from relit.fit.joint_alignment import follow_views
 from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
-from relit.fit.odd_instances import odd_instances
+from relit.fit.odd_instances import odd_instances, view_errors
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
+from relit.fit.pixels import PixelBank
 from relit.fit.register import crop_rings
 from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
@@ -34,24 +36,49 @@ from relit.scene import Mesh
 
 HOLD = 40  # steps of a volume pass of one level before poses move
 HOLD_OPENED = 100  # the same of a pass that begins with the shape of the one before, mended
-PASSES, ORDINALS = 4, ("first", "second", "third", "fourth")  # volume passes for the poses alone, at most
-JOINT = ("joint", *(f"joint_{k}" for k in range(2, PASSES + 1)))  # their stages
+PASSES = 4  # volume passes for the poses alone, at most, until those who were left out are sought, and again where they have joined
+ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
+JOINT = ("joint", *(f"joint_{k}" for k in range(2, 2 * PASSES + 1)))  # their stages
+WORSE = 1.1  # times the others' error with those who have joined, and these are out again
 ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last one
 CLOSE, CLOSER = 0.25, 0.8  # so was one that leaves textures within these pixels, or within so much of what the one before left
+
+
+Seek = Callable[[list[View], np.ndarray, np.ndarray, VolumeModel, PixelBank], dict[int, np.ndarray]]  # see `fit.found_again.joiners`
 
 
 @dataclass(frozen=True)
 class Pass:
     """What a volume pass for the poses alone gives. poses: (N, 4, 4). odd: (N,) bool, who shows what does not agree with the model of all.
-    turn: degrees by which it has turned the instances, the median. off: pixels, see `followed`. symmetry: of its shape; None where that is
-    not even. mixed: whether instances were turned then by which the object nearly looks like itself: what it has built is of no use."""
+    errors: (N,) squared differences, see `view_errors`. turn: degrees by which it has turned the instances, the median. off: pixels, see
+    `followed`. symmetry: of its shape; None where that is not even. mixed: whether instances were turned then by which the object nearly
+    looks like itself: what it has built is of no use. found: poses, by key, of those who are to take part in the next."""
 
     poses: np.ndarray
     odd: np.ndarray
+    errors: np.ndarray
     turn: float
     off: float | None
     symmetry: Symmetry | None
     mixed: bool = False
+    found: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a stage keeps of it, see `pass_from`."""
+        who = {"found": np.array([*self.found], int), "there": np.array([*self.found.values()]).reshape(-1, 4, 4)}
+        off = {} if self.off is None else {"off": self.off}
+        symmetry = self.symmetry.arrays if self.symmetry else {}
+        return {
+            "poses": self.poses,
+            "odd": self.odd,
+            "errors": self.errors,
+            "turn": self.turn,
+            "mixed": self.mixed,
+            **who,
+            **off,
+            **symmetry,
+        }
 
     @property
     def exact(self) -> bool:
@@ -67,39 +94,76 @@ class Pass:
         return settled or self.turn < ARRIVED or self.exact
 
 
-def joint_stages(views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int):
-    """(poses, odd (N,) bool, arrived: see `Pass`, the last pass) after a first volume pass, and others while textures say that poses are
-    still on their way (at most PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree with
-    the model of all. A shape that grew up with better poses is sharper, and moves them on."""
-    poses, odd, last, arrived = poses.copy(), np.zeros(len(views), bool), None, False
-    for number in range(PASSES):
-        rest = np.flatnonzero(~odd)
-        one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last)
-        poses[rest], odd[rest] = one.poses, one.odd
-        last, arrived = one, one.arrived(last)
-        if arrived or one.off is None:
-            break
-    return poses, odd, arrived, last
+def pass_from(saved: dict[str, np.ndarray]) -> Pass:
+    """The pass that a stage has kept."""
+    off = float(saved["off"]) if "off" in saved else None
+    found = dict(zip(saved["found"].tolist(), saved["there"], strict=True))
+    return Pass(saved["poses"], saved["odd"], saved["errors"], float(saved["turn"]), off, symmetry_from(saved), bool(saved["mixed"]), found)
 
 
-def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options: DuplicatesOptions, seed: int, last: Pass | None) -> Pass:
-    """One such pass. last: the one before. Textures are asked here already: what the pass has built in the wrong place
-    it does not take back."""
+def joint_stages(views: list[View], poses: np.ndarray, others: list[View], seek: Callable, run, options: DuplicatesOptions, seed: int):
+    """(views, poses, odd (N,) bool, arrived: see `Pass`, the last pass) after a first volume pass, and others while textures say that poses
+    are still on their way (at most PASSES): what each gives is thrown away but for the poses, and which instances show what does not agree
+    with the model of all. A shape that grew up with better poses is sharper, and moves them on. Those of `others` whom the last pass finds
+    (see `fit.found_again.joiners`) take part in more, until poses have arrived again, and the rest is sought once more then; where those of
+    before agree clearly less for it, all is as it was. seek: of those who are sought, and as Seek."""
+    views, poses, odd, last, arrived, ago = list(views), poses.copy(), np.zeros(len(views), bool), None, False, None
+    number, end = 0, PASSES
+    while True:
+        left = [v for v in others if v.key not in {w.key for w in views}]
+        while number < end:
+            rest = np.flatnonzero(~odd)
+            asked = partial(seek, left) if left and number + 1 < len(JOINT) else None
+            one = joint_stage([views[k] for k in rest], poses[rest], number, run, options, seed, last, asked, number + 1 == end)
+            poses[rest], odd[rest] = one.poses, one.odd
+            last, arrived, number = one, one.arrived(last), number + 1
+            if arrived or one.off is None:
+                break
+        if ago and worse(ago[-1], last):
+            run.say("the others agree less for it: all is as it was before")
+            return ago
+        if not last.found:
+            return views, poses, odd, arrived, last
+        ago, end = ([*views], poses.copy(), odd, arrived, last), min(number + PASSES, len(JOINT))
+        back = [v for v in left if v.key in last.found]
+        views, odd = [*views, *back], np.append(odd, np.zeros(len(back), bool))
+        poses = np.concatenate([poses, *(last.found[v.key][None] for v in back)])
+
+
+def worse(before: Pass, after: Pass) -> bool:
+    """Whether those who took part in a pass agree clearly less with the model of a later one, in which more do."""
+    stayed = before.errors[~before.odd]  # those who joined come after them
+    return bool(np.nanmedian(after.errors[: len(stayed)]) > WORSE * np.nanmedian(stayed))
+
+
+def joint_stage(
+    views: list[View],
+    poses: np.ndarray,
+    number: int,
+    run,
+    options: DuplicatesOptions,
+    seed: int,
+    last: Pass | None,
+    seek: Seek | None = None,
+    final: bool = False,
+) -> Pass:
+    """One such pass. last: the one before. Textures are asked here already: what the pass has built in the wrong place it does not take
+    back. seek: finds those who are to take part in the next one, where this is final, or poses have arrived with it."""
     name = JOINT[number]
     if run.done(name):
-        saved = run_arrays(run, name, "joint")
-        off = float(saved["off"]) if "off" in saved else None
-        return Pass(saved["poses"], saved["odd"], float(saved["turn"]), off, symmetry_from(saved), bool(saved.get("mixed", False)))
+        return pass_from(run_arrays(run, name, "joint"))
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
-        before, off, turned = poses, None, None
+        before, off, turned, found = poses, None, None, {}
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, last and last.symmetry)
-        odd = odd_instances(bank, model, seed)
+        built = poses.copy()
+        errors = view_errors(bank, model, seed)
+        odd = odd_instances(errors)
+        some = [views[k] for k in np.flatnonzero(~odd)]
         for k in np.flatnonzero(odd):
             run.say(f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all")
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         if "textures" not in options.without:
-            some = [views[k] for k in np.flatnonzero(~odd)]
             better, moved, off = followed(mesh, some, poses[~odd], run, options)
             if off is not None:
                 mesh, poses[~odd] = better, moved
@@ -111,9 +175,11 @@ def joint_stage(views: list[View], poses: np.ndarray, number: int, run, options:
             run.say("the object is its own mirror image: its silhouettes bound it from both sides")
         if turned is not None:
             poses[~odd] = turned
-        kept = {} if off is None else {"off": off}
-        stage.save("joint", poses=poses, odd=odd, turn=turn, mixed=turned is not None, **kept, **(symmetry.arrays if symmetry else {}))
-    return Pass(poses, odd, turn, off, symmetry, turned is not None)
+        one = Pass(poses, odd, errors, turn, off, symmetry, turned is not None)
+        if seek and turned is None and (off is None or one.arrived(last) or final):
+            found = seek(some, built[~odd], poses[~odd], model, bank)
+        stage.save("joint", **replace(one, found=found).arrays)
+    return replace(one, found=found)
 
 
 def told_apart(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
