@@ -15,6 +15,7 @@ from relit.fit.found_again import carried, joiners, with_found
 from relit.fit.instances import View
 from relit.fit.lit_pile import LitPile, lit_pile, surface_options
 from relit.fit.loop import NoStage
+from relit.fit.loose_parts import without_loose_parts
 from relit.fit.mirrored import Symmetry
 from relit.fit.pile_photos import Scene
 from relit.fit.pile_scene import distance_in, find_ground, set_down
@@ -59,6 +60,10 @@ def shape_stages(
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         values = dense_values(model.grid)
         mesh = extract_mesh(values, faces=options.faces)
+        cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+        mesh, loose = without_loose_parts(mesh, cameras, [v.mask for v in views], [v.known for v in views])
+        if loose:
+            run.say(f"{loose} loose parts that no silhouette asks for are left out of the shape")
         if follow is not None:
             mesh, poses, _ = follow(mesh, views, poses, run, options)
         if follow is not placed_by_outlines:  # where textures lie on one another, poses have left no bumps

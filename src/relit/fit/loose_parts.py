@@ -1,0 +1,73 @@
+"""Parts of a shape that hang loose beside it and that no silhouette asks for.
+
+Where no view looks past the object a lump can stay that nothing bounds: in every silhouette it lies before or behind the rest, and views
+that disagree paint it. What is fastened to nothing, and covers nothing of the silhouettes that the rest does not cover too, is no part of
+the object. What the object really has beside it (a lid in the air, a handle whose ends were lost) stands out of the rest in some view.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from relit.rendering.mitsuba_scene import build_geometry
+from relit.scene import Camera, Mesh
+
+ASKED = 0.1  # share of what a part covers of the silhouettes, all together, that must be its own for it to stay: outlines are a pixel off
+SIDE = 200  # pixels that are looked at, the longer side of a view
+
+
+def without_loose_parts(mesh: Mesh, cameras: list[Camera], masks, known) -> tuple[Mesh, int]:
+    """(the mesh without loose parts that no silhouette asks for, how many these were). The largest part by area stays.
+
+    cameras: of the views, in the mesh's frame. masks, known: (H, W) of each: the silhouette, and where it is known.
+    """
+    parts = parts_of(mesh)
+    if len(parts) < 2:
+        return mesh, 0
+    scenes = [build_geometry(p) for p in parts]
+    rays = [silhouette_rays(*view) for view in zip(cameras, masks, known, strict=True)]
+    covered = [np.array([np.array(scene.ray_test(ray)) for scene in scenes]) for ray in rays]  # (parts, rays) of each view
+    stays, covered = [0], np.concatenate(covered, 1)
+    for k in range(1, len(parts)):
+        own = covered[k] & ~covered[stays].any(0)
+        if own.sum() > ASKED * covered[k].sum():
+            stays.append(k)
+    return (mesh, 0) if len(stays) == len(parts) else (joined([parts[k] for k in stays]), len(parts) - len(stays))
+
+
+def parts_of(mesh: Mesh) -> list[Mesh]:
+    """The parts of a mesh that hang together, the largest first."""
+    a, b, c = mesh.faces.T
+    links = coo_matrix((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, c])), (len(mesh.vertices), len(mesh.vertices)))
+    part = connected_components(links, directed=False)[1][a]
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.bincount(part, np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
+    return [of_faces(mesh, part == k) for k in np.argsort(-area)[: (area > 0).sum()]]
+
+
+def of_faces(mesh: Mesh, chosen: np.ndarray) -> Mesh:
+    """What some faces (F,) bool of a mesh are made of."""
+    used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(mesh.faces.dtype), mesh.normals[used])
+
+
+def joined(parts: list[Mesh]) -> Mesh:
+    """One mesh of several."""
+    starts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
+    faces = np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=True)]).astype(parts[0].faces.dtype)
+    return Mesh(np.concatenate([p.vertices for p in parts]), faces, np.concatenate([p.normals for p in parts]))
+
+
+def silhouette_rays(camera: Camera, mask: np.ndarray, known: np.ndarray) -> mi.Ray3f:
+    """Rays through pixels of a silhouette."""
+    step = max(1, round(max(mask.shape) / SIDE))
+    y, x = np.nonzero((mask[::step, ::step] > 0.5) & (known[::step, ::step] > 0.5))
+    at = np.stack([x * step + 0.5, y * step + 0.5], -1)
+    d = np.concatenate([(at - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((len(at), 1))], 1)
+    d = d @ camera.world_from_camera[:3, :3].T
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    o = np.broadcast_to(camera.centre, d.shape)
+    return mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
