@@ -125,6 +125,7 @@ def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
         ([20.0, 30.0], [18.0, 26.0], False, 3),  # it does not
         ([30.0, 60.0], [22.0, 60.0], False, 3),  # it leads, but too far off
         ([20.0, 30.0], [7.0, 30.0], True, 1),  # certain by then
+        ([45.0, 90.0], None, False, 1),  # nothing like it
     ],
 )
 def test_the_best_places_are_looked_into_where_none_is_certain(lump, monkeypatch, first, then, taken, rounds):
@@ -139,7 +140,8 @@ def test_the_best_places_are_looked_into_where_none_is_certain(lump, monkeypatch
     monkeypatch.setattr(module, "candidates", lambda *_: np.stack([poses[1], poses[0], turned_about(poses[0], 0.1), turned]))
     monkeypatch.setattr(module, "descended", descended)
     pose, sure = sought_again(hidden, guide, poses[0], None, 1.0, None, none, 5, guess=True)
-    assert asked == [(module.STEPS, 4), (module.LONGER, 2)] * rounds and sure == (then[0] < module.AGREES)
+    assert asked == ([(module.STEPS, 4), (module.LONGER, 2)] * rounds if then else [(module.STEPS, 4)])
+    assert sure == (then is not None and then[0] < module.AGREES)
     assert pose is None if not taken else np.array_equal(pose, poses[1])
 
 

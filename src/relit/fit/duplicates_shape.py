@@ -63,7 +63,7 @@ def shape_stages(
         cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
         mesh, loose = without_loose_parts(mesh, cameras, [v.mask for v in views], [v.known for v in views])
         if loose:
-            run.say(f"{loose} loose parts that no silhouette asks for are left out of the shape")
+            run.say(f"left out of the shape: {loose} loose part{'s' * (loose > 1)} that no silhouette asks for")
         if follow is not None:
             mesh, poses, _ = follow(mesh, views, poses, run, options)
         if follow is not placed_by_outlines:  # where textures lie on one another, poses have left no bumps

@@ -40,6 +40,7 @@ TURNS = 24  # about an axis that is known
 # times the others' error at most, or FAR times where any other place leaves LEADS times as much: worth a trial. Of two trucks that showed
 # what no other did the right places left 9 to 12 (all others 2 times as much); cows and cups among them 15 to 50 (1.0 to 1.4 times)
 GUESS, FAR, LEADS = 12.0, 20.0, 1.6
+HOPELESS = 40.0  # times it at all places that were tried first: no guess is sought on
 MORE, LONGER = 3, 600  # places that are looked into for that, and steps: what shades them is slow to find
 ROUNDS = 3  # other places are tried so often where none agrees: the right one may be too far from all of them to descend there
 STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
@@ -82,6 +83,8 @@ def sought_again(
             there = where_outlines_agree(errors, view, poses, model)
             if np.isfinite(there).any():
                 return turned(view, likeliest(poses, there, level)[0]), False
+        if guess and np.nanmin(errors) > HOPELESS * level:
+            break
         if guess:
             best = best_places(poses, errors)[:MORE]
             poses, errors = descended(view, guide, guide_pose, poses[best], model, turns, LONGER, seed + turn)
