@@ -104,7 +104,6 @@ def test_posterior_silences_what_is_out_of_line():
 
 
 def test_scale_is_exchanged_without_a_change_of_what_is_diffuse():
-
     from relit.fit.collection_surface import exchange_scale
     from relit.fit.loop import Adam
     from relit.materials.field import start_material

@@ -321,6 +321,8 @@ def test_a_pass_is_kept_whole():
     assert again.off is None and again.symmetry is None and again.mixed and again.turn == 1.5
     assert np.array_equal(again.errors, one.errors) and np.array_equal(again.odd, one.odd) and list(again.found) == [7]
     assert np.array_equal(again.found[7], np.eye(4)) and not pose_passes.pass_from(replace(one, found={}).arrays).found
+    old = pose_passes.pass_from({k: v for k, v in one.arrays.items() if k not in ("errors", "found", "there", "mixed")})
+    assert not old.found and not old.mixed and np.isnan(old.errors).all() and len(old.errors) == 2
 
 
 def test_who_joins_is_sought_where_few_are_left_out(monkeypatch):
@@ -334,15 +336,13 @@ def test_who_joins_is_sought_where_few_are_left_out(monkeypatch):
         asked.clear()
         monkeypatch.setattr(found_again, "seeker", lambda *_: sought)
         monkeypatch.setattr(found_again, "body_axis", lambda mesh: axis)
-        monkeypatch.setattr(found_again, "extract_mesh", lambda values: None)
-        monkeypatch.setattr(found_again, "dense_values", lambda grid: None)
         others = [SimpleNamespace(key=k, label=k, photo=0) for k in keys]
         poses = np.tile(np.eye(4), (count, 1, 1))
         poses[:, 0, 3] = np.arange(count)
         after = poses + np.eye(4)[3] * np.array([[2.0], [0], [0], [0]])
         options = replace(recipe.options_for("standard"), without=without)
         how = {"run": SimpleNamespace(say=said.append), "options": options, "seed": 0}
-        return found_again.joiners(others, ["a view"] * count, poses, after, SimpleNamespace(grid=None), None, **how)
+        return found_again.joiners(others, ["a view"] * count, poses, after, None, None, 0.1, **how)
 
     found = joined(12, 1, 2, 3)
     assert asked == [1, 2, 3] and list(found) == [1, 2] and found[1][0, 3] == 2, "in the frame that poses have after the pass"

@@ -7,7 +7,7 @@ import pytest
 
 from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
-from relit.fit.loose_parts import joined, parts_of, without_loose_parts
+from relit.fit.loose_parts import faces_by_part, of_faces, without_loose_parts
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
@@ -59,11 +59,13 @@ def test_what_no_silhouette_asks_for_goes(angles, shown, hidden, loose):
     assert np.allclose((left.normals * left.vertices / np.linalg.norm(left.vertices, axis=1, keepdims=True)).sum(1)[:100], 1, atol=0.02)
 
 
-def test_parts_are_told_apart_and_joined_again():
+def test_parts_are_told_apart():
     mesh = balls(SMALL, -SMALL)
-    parts = parts_of(mesh)
-    assert len(parts) == 3 and len(parts[0].faces) > 4 * len(parts[1].faces)
-    again = joined(parts)
-    key = lambda m: np.sort(m.vertices[m.faces].reshape(len(m.faces), -1), axis=0)  # noqa: E731
-    assert np.array_equal(key(again), key(mesh))
+    part = faces_by_part(mesh)
+    counts = np.bincount(part)
+    assert len(counts) == 3 and counts[0] > 4 * counts[1] and counts.sum() == len(mesh.faces)
+    ball = of_faces(mesh, part == 0)
+    assert np.allclose(np.linalg.norm(ball.vertices, axis=1), 0.5, atol=0.01) and len(ball.faces) == counts[0]
+    middles = [of_faces(mesh, part == k).vertices.mean(0) for k in (1, 2)]
+    assert np.allclose(sorted(m[2] for m in middles), [-0.75, 0.75], atol=0.01)
     assert without_loose_parts(balls(), [], [], [])[1] == 0

@@ -126,6 +126,7 @@ def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
         ([30.0, 60.0], [22.0, 60.0], False, 3),  # it leads, but too far off
         ([20.0, 30.0], [7.0, 30.0], True, 1),  # certain by then
         ([45.0, 90.0], None, False, 1),  # nothing like it
+        ([np.nan, np.nan], None, False, 1),  # no pixel is whole
     ],
 )
 def test_the_best_places_are_looked_into_where_none_is_certain(lump, monkeypatch, first, then, taken, rounds):
@@ -134,7 +135,7 @@ def test_the_best_places_are_looked_into_where_none_is_certain(lump, monkeypatch
 
     def descended(view, guide, guide_pose, tried, model, turns, steps, seed):
         asked.append((steps, len(tried)))
-        return tried, np.array([*first, first[1] + 1, 90.0] if steps == module.STEPS else then)
+        return tried, np.array([*first, first[1] + 1, first[1] + 60] if steps == module.STEPS else then)
 
     turned = turned_about(poses[1], 0.1)  # of one place the better descent counts
     monkeypatch.setattr(module, "candidates", lambda *_: np.stack([poses[1], poses[0], turned_about(poses[0], 0.1), turned]))

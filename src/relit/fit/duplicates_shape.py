@@ -153,8 +153,8 @@ def volume_stage(
     with run.stage("volume", steps=steps, title="shape and poses (volume pass)") as stage:
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, symmetry, still=arrived, vessel=vessel)
         if others and pose_rate(views, options) > 0 and "search" not in options.without:
-            stayed = np.array([v.key in before for v in views])
-            on_axes = carried(on_axes, np.array([before[v.key] for v in views if v.key in before]), poses[stayed])
+            stayed = [k for k, v in enumerate(views) if v.key in before]
+            on_axes = carried(on_axes, np.array([before[views[k].key] for k in stayed]), poses[stayed])
             views, poses, vague = with_found(views, poses, others, on_axes, model, bank, run, seed)
         return views, poses, model, follow, vague
 

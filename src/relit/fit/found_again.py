@@ -36,7 +36,8 @@ def joiners(
     poses: np.ndarray,
     after: np.ndarray,
     model: VolumeModel,
-    bank: PixelBank,
+    mesh: Mesh,
+    level: float,
     *,
     run,
     options: DuplicatesOptions,
@@ -45,15 +46,15 @@ def joiners(
     """Poses, by key, of those of `others` who are to take part in the next pass: what shows them is found in the model of this one, or
     nearly. So few are taken that they are told to be odd if they stand wrong (fit/odd_instances.py).
 
-    views: of the pass. poses, after: theirs (N, 4, 4) in its model, and what became of them then, which the result goes with. bank: of the
-    model.
+    views: of the pass. poses, after: theirs (N, 4, 4) in its model, and what became of them then, which the result goes with. mesh: of the
+    pass. level: median of the views' errors.
     """
     count = len(views) + len(others)
     if "search" in options.without or len(views) < LEAST or count > MANY or len(others) > MOST * count:
         return {}
-    if body_axis(extract_mesh(dense_values(model.grid))) is not None:  # these are placed by their outlines, in the end
+    if body_axis(mesh) is not None:  # these are placed by their outlines, in the end
         return {}
-    seek, found = seeker(views, poses, model, bank, seed), {}
+    seek, found = seeker(views, poses, model, level, seed), {}
     for view in others:
         pose, sure = seek(view, guess=True)
         if pose is not None:
@@ -63,9 +64,9 @@ def joiners(
     return carried(found, poses, after)
 
 
-def seeker(views: list[View], poses: np.ndarray, model: VolumeModel, bank: PixelBank, seed: int) -> Callable:
-    """`sought_again` in the model of a pass; views, poses: that it was fitted to."""
-    level, scene = float(np.nanmedian(view_errors(bank, model, seed))), related(views, poses)
+def seeker(views: list[View], poses: np.ndarray, model: VolumeModel, level: float, seed: int) -> Callable:
+    """`sought_again` in the model of a pass; views, poses: that it was fitted to. level: median of their errors."""
+    scene = related(views, poses)
     turns = None if len(scene.motions) == 1 else lambda some: light_turns(some, scene)
     galleries = lru_cache(1)(partial(galleries_of, model, float(np.linalg.norm(poses[0][:3, 3]))))  # they are large
 
@@ -79,7 +80,8 @@ def with_found(
     views: list[View], poses: np.ndarray, others: list[View], on_axes: dict[int, np.ndarray], model: VolumeModel, bank: PixelBank, run, seed
 ):
     """(views, poses, vague: see `volume_stage`) with those of `others` that are found in the model, which gets their entries."""
-    seek, mesh = seeker(views, poses, model, bank, seed), extract_mesh(dense_values(model.grid))
+    level, mesh = float(np.nanmedian(view_errors(bank, model, seed))), extract_mesh(dense_values(model.grid))
+    seek = seeker(views, poses, model, level, seed)
     found, vague, turned = [], [], turned_by_others(mesh, views, poses)
     for view in others:
         pose, sure = seek(view, on_axis=on_axes.get(view.key), turned=turned)

@@ -24,41 +24,35 @@ def without_loose_parts(mesh: Mesh, cameras: list[Camera], masks, known) -> tupl
 
     cameras: of the views, in the mesh's frame. masks, known: (H, W) of each: the silhouette, and where it is known.
     """
-    parts = parts_of(mesh)
-    if len(parts) < 2:
+    part = faces_by_part(mesh)
+    count = part.max() + 1
+    if count < 2:
         return mesh, 0
-    scenes = [build_geometry(p) for p in parts]
+    scenes = [build_geometry(of_faces(mesh, part == k)) for k in range(count)]
     rays = [silhouette_rays(*view) for view in zip(cameras, masks, known, strict=True)]
-    covered = [np.array([np.array(scene.ray_test(ray)) for scene in scenes]) for ray in rays]  # (parts, rays) of each view
-    stays, covered = [0], np.concatenate(covered, 1)
-    for k in range(1, len(parts)):
+    covered = np.concatenate([np.array([np.array(scene.ray_test(ray)) for scene in scenes]) for ray in rays], 1)  # (parts, rays)
+    stays = [0]
+    for k in range(1, count):
         own = covered[k] & ~covered[stays].any(0)
         if own.sum() > ASKED * covered[k].sum():
             stays.append(k)
-    return (mesh, 0) if len(stays) == len(parts) else (joined([parts[k] for k in stays]), len(parts) - len(stays))
+    return (mesh, 0) if len(stays) == count else (of_faces(mesh, np.isin(part, stays)), int(count) - len(stays))
 
 
-def parts_of(mesh: Mesh) -> list[Mesh]:
-    """The parts of a mesh that hang together, the largest first."""
+def faces_by_part(mesh: Mesh) -> np.ndarray:
+    """(F,) the number of the part that each face hangs together with; the largest part by area is 0, the next one 1."""
     a, b, c = mesh.faces.T
     links = coo_matrix((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, c])), (len(mesh.vertices), len(mesh.vertices)))
-    part = connected_components(links, directed=False)[1][a]
+    _, part = np.unique(connected_components(links, directed=False)[1][a], return_inverse=True)  # vertices without faces are none
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     area = np.bincount(part, np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
-    return [of_faces(mesh, part == k) for k in np.argsort(-area)[: (area > 0).sum()]]
+    return np.argsort(np.argsort(-area))[part]
 
 
 def of_faces(mesh: Mesh, chosen: np.ndarray) -> Mesh:
     """What some faces (F,) bool of a mesh are made of."""
     used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(mesh.faces.dtype), mesh.normals[used])
-
-
-def joined(parts: list[Mesh]) -> Mesh:
-    """One mesh of several."""
-    starts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
-    faces = np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=True)]).astype(parts[0].faces.dtype)
-    return Mesh(np.concatenate([p.vertices for p in parts]), faces, np.concatenate([p.normals for p in parts]))
 
 
 def silhouette_rays(camera: Camera, mask: np.ndarray, known: np.ndarray) -> mi.Ray3f:

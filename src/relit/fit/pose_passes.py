@@ -23,7 +23,6 @@ from relit.fit.mirrored import Symmetry, find_symmetry, mirrored_rays, mirrored_
 from relit.fit.odd_instances import odd_instances, view_errors
 from relit.fit.outlines import follow_with_poses
 from relit.fit.pile_photos import Scene, gather
-from relit.fit.pixels import PixelBank
 from relit.fit.register import crop_rings
 from relit.fit.vessels import body_axis
 from relit.fit.volume import VolumeModel, VolumeOptions, fit_volume, start_model
@@ -44,7 +43,7 @@ ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last o
 CLOSE, CLOSER = 0.25, 0.8  # so was one that leaves textures within these pixels, or within so much of what the one before left
 
 
-Seek = Callable[[list[View], np.ndarray, np.ndarray, VolumeModel, PixelBank], dict[int, np.ndarray]]  # see `fit.found_again.joiners`
+Seek = Callable[[list[View], np.ndarray, np.ndarray, VolumeModel, Mesh, float], dict[int, np.ndarray]]  # see `fit.found_again.joiners`
 
 
 @dataclass(frozen=True)
@@ -96,6 +95,8 @@ class Pass:
 
 def pass_from(saved: dict[str, np.ndarray]) -> Pass:
     """The pass that a stage has kept."""
+    nothing = {"mixed": False, "errors": np.full(len(saved["poses"]), np.nan), "found": np.zeros(0, int), "there": np.zeros((0, 4, 4))}
+    saved = nothing | saved  # runs of before have less
     off = float(saved["off"]) if "off" in saved else None
     found = dict(zip(saved["found"].tolist(), saved["there"], strict=True))
     return Pass(saved["poses"], saved["odd"], saved["errors"], float(saved["turn"]), off, symmetry_from(saved), bool(saved["mixed"]), found)
@@ -154,7 +155,7 @@ def joint_stage(
         return pass_from(run_arrays(run, name, "joint"))
     title = f"shape and poses ({ORDINALS[number]} pass)"
     with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
-        before, off, turned, found = poses, None, None, {}
+        before, off, turned = poses, None, None
         model, bank, poses = shape_and_poses(views, poses, run, stage, options, seed, last and last.symmetry)
         built = poses.copy()
         errors = view_errors(bank, model, seed)
@@ -177,9 +178,9 @@ def joint_stage(
             poses[~odd] = turned
         one = Pass(poses, odd, errors, turn, off, symmetry, turned is not None)
         if seek and turned is None and (off is None or one.arrived(last) or final):
-            found = seek(some, built[~odd], poses[~odd], model, bank)
-        stage.save("joint", **replace(one, found=found).arrays)
-    return replace(one, found=found)
+            one = replace(one, found=seek(some, built[~odd], poses[~odd], model, mesh, float(np.nanmedian(errors))))
+        stage.save("joint", **one.arrays)
+    return one
 
 
 def told_apart(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:

@@ -74,6 +74,8 @@ def sought_again(
         if len(poses) == 0:
             continue
         poses, errors = descended(view, guide, guide_pose, poses, model, turns, STEPS, seed + turn)
+        if np.isnan(errors).all():  # none of its pixels is whole: it tells nothing
+            break
         pose, certain = likeliest(poses, errors, level)
         if certain:
             return pose, True
@@ -83,9 +85,9 @@ def sought_again(
             there = where_outlines_agree(errors, view, poses, model)
             if np.isfinite(there).any():
                 return turned(view, likeliest(poses, there, level)[0]), False
-        if guess and np.nanmin(errors) > HOPELESS * level:
-            break
         if guess:
+            if np.nanmin(errors) > HOPELESS * level:
+                break
             best = best_places(poses, errors)[:MORE]
             poses, errors = descended(view, guide, guide_pose, poses[best], model, turns, LONGER, seed + turn)
             pose, certain = likeliest(poses, errors, level)
