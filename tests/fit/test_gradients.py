@@ -14,7 +14,7 @@ from lump import lump
 
 from relit.cameras.se3 import look_at
 from relit.conventions import environment_directions
-from relit.fit.lit_pile import TOE
+from relit.fit.lit_pile import TINT, TOE
 from relit.fit.losses import display_loss, mask_loss, normal_loss
 from relit.fit.pixels import batch_of, make_bank
 from relit.fit.surface import SurfaceOptions, common_scale, dual_loss, light_prior, material_prior, neighbours, parsimony, slope_prior
@@ -181,7 +181,7 @@ class SurfaceScene:
 
 SCENES = {
     "surface": SurfaceScene,
-    "pile": lambda: SurfaceScene(scale_power=1.0, parsimony_toe=TOE),
+    "pile": lambda: SurfaceScene(scale_power=1.0, parsimony_toe=TOE, light_tint=TINT),
     **{kind: lambda k=kind: VolumeScene(k) for kind in ("volume", "matt", "saddle")},
 }
 

@@ -107,3 +107,17 @@ def test_light_prior_prefers_even_grey_light():
     turned = number(light_prior(mi.Float(np.roll(rough, 3, axis=1).ravel()), options))
     assert cost["flat"] < cost["tinted"] and cost["flat"] < cost["rough"]
     assert turned == pytest.approx(cost["rough"], rel=1e-5)  # it wraps round: no direction is special
+
+
+def test_light_prior_asks_more_of_tints_that_change():
+    rng = np.random.default_rng(6)
+    grey, tints = rng.normal(size=(4, 8, 1)).repeat(3, -1), rng.normal(size=(4, 8, 3))
+    tints -= tints.mean(-1, keepdims=True)
+
+    def cost(light, tint):
+        options = SurfaceOptions(light=4, light_smooth=1.0, light_neutral=0.0, light_tint=tint)
+        return number(light_prior(mi.Float(light.astype(np.float32).ravel()), options))
+
+    even = cost(np.zeros((4, 8, 3)), 4.0)  # what the square root adds where nothing changes
+    assert cost(grey, 4.0) - even == pytest.approx(cost(grey, 0.0) - even / 5, rel=1e-3)
+    assert cost(tints, 4.0) == pytest.approx(5 * cost(tints, 0.0), rel=1e-5)

@@ -17,6 +17,7 @@ from relit.rendering.transport import TraceableMesh
 from relit.scene import Camera, Mesh
 
 TOE = 0.05  # see `surface.parsimony`
+TINT = 4.0  # of `surface.light_prior`: light changes its tint less from place to place than its strength
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class LitPile:
 
 def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
     off = {"metallic_binary": 0.0, "metallic_sparse": 0.0} if "metal" in o.without else {}
-    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, scale_power=1.0, parsimony_toe=TOE, **off)
+    light = {"light_tint": TINT, "light_cells": True}
+    return SurfaceOptions(o.surface_steps, o.points, o.directions, o.texture, o.light, scale_power=1.0, parsimony_toe=TOE, **light, **off)
 
 
 def lit_pile(shots, camera: Camera, mesh: Mesh, parts, max_pixels: int, *, alone: bool = False) -> LitPile:

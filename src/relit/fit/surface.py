@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.exchange import REFRESH, Exchange
+from relit.fit.light_steps import LightSteps
 from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.losses import display_weight, weighted_mean
 from relit.fit.pixels import SATURATED, PixelBank, batch_of, draw_pixels, saturated_at
@@ -40,8 +41,9 @@ class SurfaceOptions:
     smooth_metallic, smooth_colour: weights of differences between similar neighbours, up to similarity_reach (unit frame) apart and
     similarity_width in base colour; smooth_shade: power of `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary,
     metallic_sparse: of m (1 - m), and of the distance of m from the side that a place began on, 0 or 1. bright: of base colour beyond
-    WHITE, squared. light_smooth: total variation of the log radiance. light_neutral: its chroma; light_even: its squared distance from its
-    mean. light_steps: after them the light rests, and `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width,
+    WHITE, squared. light_smooth: total variation of the log radiance, of its tint
+    light_tint times that more. light_cells: it moves by `LightSteps`. light_neutral: its chroma; light_even: its squared distance from
+    its mean. light_steps: after them the light rests, and `parsimony`, which helps to find it, ends; 0: never. parsimony, parsimony_width,
     parsimony_toe: see `parsimony`. slope_rate, slope_begin: of the normal map, and the part of the steps after which it moves.
     slope_small, slope_smooth: weights of `slope_prior`, whose neighbours are up to slope_reach apart. slope_calm: floor of its optimiser
     (see `Adam`), so that noise does not move it at full rate.
@@ -72,6 +74,8 @@ class SurfaceOptions:
     bright: float = 0.3
     light_smooth: float = 0.002
     light_neutral: float = 2e-4
+    light_tint: float = 0.0
+    light_cells: bool = False
     light_even: float = 0.0
     light_steps: int = 0
     scale_power: float = 0.5
@@ -159,6 +163,8 @@ def fit_surface(
     adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, light_parameters(model)))
     adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
     adam = {"colour": adam_colour, "metallic": adam_metallic, "slope": adam_slope, "light": adam_light, "exchange": exchange.adam}
+    cells = LightSteps(options.light) if options.light_cells and gaussians is None else None
+    adam |= cells.adam if cells else {}
     recall(saved, rng, adam)
     if saved and "followed" in saved:
         exchange.refresh(mi.Float(saved["followed"]))
@@ -222,7 +228,9 @@ def fit_surface(
 
     def move_light(i: int, gradient, colour_gradient) -> None:
         decay = cosine_decay(i / light_steps, 0.05)
-        if gaussians is None:
+        if cells is not None:
+            model.log_light = cells.step(dr.detach(model.log_light), gradient, options.light_rate * decay)
+        elif gaussians is None:
             model.log_light = adam_light.step(dr.detach(model.log_light), gradient, options.light_rate * decay)
         else:
             gaussians.parameters = adam_light.step(dr.detach(gaussians.parameters), gradient, options.light_rate * decay, gaussians.rates)
@@ -361,7 +369,7 @@ def slope_prior(material: MaterialField, bend, close: Points, valid, options: Su
 
 
 def light_prior(log_light, options: SurfaceOptions):
-    """Total variation of the log radiance over the lat-long map, and its chroma (difference from grey)."""
+    """Total variation over the lat-long map, of the log radiance and of its tint (difference from grey), and the tint squared."""
     h, w = options.light, 2 * options.light
     i = dr.arange(mi.UInt32, h * w)
     row, column = i // w, i % w
@@ -370,12 +378,12 @@ def light_prior(log_light, options: SurfaceOptions):
     below = dr.gather(mi.Color3f, log_light, dr.minimum(row + 1, h - 1) * w + column)
     area = dr.sin((mi.Float(row) + 0.5) * (dr.pi / h))
     soft = lambda c: dr.sqrt(dr.squared_norm(mi.Vector3f(c)) + 1e-4)  # noqa: E731
+    tint = lambda c: c - (c.x + c.y + c.z) / 3  # noqa: E731
+    change = soft(right - here) + soft(below - here)
+    if options.light_tint > 0:
+        change += options.light_tint * (soft(tint(right - here)) + soft(tint(below - here)))
     grey = (here.x + here.y + here.z) / 3
     chroma = dr.squared_norm(mi.Vector3f(here - grey))
     middle = dr.detach(dr.sum(grey * area) / dr.sum(area))
     even = options.light_even * dr.mean(dr.square(grey - middle) * area)
-    return (
-        even
-        + options.light_smooth * dr.mean((soft(right - here) + soft(below - here)) * area)
-        + options.light_neutral * dr.mean(chroma * area)
-    )
+    return even + options.light_smooth * dr.mean(change * area) + options.light_neutral * dr.mean(chroma * area)

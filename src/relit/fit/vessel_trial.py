@@ -56,7 +56,7 @@ def vessel_of(
         return None
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
     flat, ends = ends_of(values, axis, views, cameras)
-    o = replace(options, steps=min(STEPS, options.steps // 2), **TRIAL)
+    o = replace(options, steps=min(STEPS, options.steps // 2), light_cells=False, light_tint=0.0, **TRIAL)  # as GAIN was measured
     best, stage = flat, NoStage(progress)
     shape, closed, fitted = flat, None, False  # what an end is asked of: as `best`, with the floor of a hollow where one of FLOORS has it
     for end in mouths(flat, axis, ends):

@@ -36,6 +36,17 @@ def lookup_latlong(texels, height: int, width: int, d, active=True, first=0):
     return dr.lerp(dr.lerp(g(top + left), g(top + right), fx), dr.lerp(g(below + left), g(below + right), fx), fy)
 
 
+def cells_of_texels(height: int, width: int, side: int = 1) -> np.ndarray:
+    """(height * width,) uint32: texels of a lat-long map gathered into cells that are `side` texels high and about as wide everywhere as
+    `side` texels are at the horizon; near the poles, where texels are slivers, many share one."""
+    rows = -(-height // side)
+    sine = np.sin((np.arange(rows) + 0.5) * np.pi / rows)
+    count = np.maximum(np.round(width / side * sine), 1).astype(int)
+    row = np.arange(height) // side
+    cell = np.arange(width) * count[row, None] // width + (np.cumsum(count) - count)[row, None]
+    return cell.ravel().astype(np.uint32)
+
+
 class Environment:
     """Radiance from infinitely far away.
 
