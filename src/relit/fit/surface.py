@@ -160,11 +160,12 @@ def fit_surface(
     count = options.points
     rng = mi.PCG32(size=count, initstate=seed * 7919 + 13)
     exchange = Exchange(model.normals, material.size**2, options.light, options.exchange_rows)
-    adam_colour, adam_metallic, adam_light = (Adam(dr.width(p)) for p in (material.colour, material.metallic, light_parameters(model)))
+    adam_colour, adam_metallic = (Adam(dr.width(p)) for p in (material.colour, material.metallic))
     adam_slope = Adam(dr.width(material.slope), floor=options.slope_calm)
-    adam = {"colour": adam_colour, "metallic": adam_metallic, "slope": adam_slope, "light": adam_light, "exchange": exchange.adam}
-    cells = LightSteps(options.light) if options.light_cells and gaussians is None else None
-    adam |= cells.adam if cells else {}
+    by_cells = options.light_cells and gaussians is None
+    light_mover = LightSteps(options.light) if by_cells else Adam(dr.width(light_parameters(model)))
+    adam = {"colour": adam_colour, "metallic": adam_metallic, "slope": adam_slope, "exchange": exchange.adam}
+    adam |= light_mover.adam if by_cells else {"light": light_mover}
     recall(saved, rng, adam)
     if saved and "followed" in saved:
         exchange.refresh(mi.Float(saved["followed"]))
@@ -228,12 +229,10 @@ def fit_surface(
 
     def move_light(i: int, gradient, colour_gradient) -> None:
         decay = cosine_decay(i / light_steps, 0.05)
-        if cells is not None:
-            model.log_light = cells.step(dr.detach(model.log_light), gradient, options.light_rate * decay)
-        elif gaussians is None:
-            model.log_light = adam_light.step(dr.detach(model.log_light), gradient, options.light_rate * decay)
+        if gaussians is None:
+            model.log_light = light_mover.step(dr.detach(model.log_light), gradient, options.light_rate * decay)
         else:
-            gaussians.parameters = adam_light.step(dr.detach(gaussians.parameters), gradient, options.light_rate * decay, gaussians.rates)
+            gaussians.parameters = light_mover.step(dr.detach(gaussians.parameters), gradient, options.light_rate * decay, gaussians.rates)
             gaussians.project()
             model.log_light = gaussians.log_radiance()
         if options.exchange_rate > 0 and gaussians is None:
