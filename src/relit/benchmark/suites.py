@@ -175,7 +175,7 @@ DUPLICATES = Suite(
         name: (f"without={name}",)
         for name in (
             *("rotation_sweep", "matching", "guided", "search", "refinement"),
-            *("textures", "symmetry", "visibility", "hidden", "metal", "first_material", "ground", "normals"),
+            *("textures", "symmetry", "visibility", "hidden", "unseen", "metal", "first_material", "ground", "normals"),
         )
     },
 )

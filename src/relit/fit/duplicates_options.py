@@ -60,6 +60,7 @@ WITHOUT = {
     "textures": "mesh and poses follow the outlines of the labels alone",
     "symmetry": "silhouettes bound the object from the sides that show them alone, also where it is its own mirror image",
     "vessels": "bodies of revolution end as silhouettes leave them",
+    "unseen": "sides that no view shows stay as large as silhouettes let them be",
     "rounding": "bodies of revolution keep the bumps that the volume pass leaves",
     "visibility": "no instance, and no ground, shadows another",
     "normals": "normal priors are not used",

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import Shot
@@ -30,6 +31,7 @@ from relit.fit.pose_passes import (
     shape_and_poses,
 )
 from relit.fit.round_bodies import made_round
+from relit.fit.unseen_sides import closed_where_unseen
 from relit.fit.vessel_trial import vessel_of
 from relit.fit.vessels import body_axis
 from relit.geometry.atlas import unwrap
@@ -58,7 +60,12 @@ def shape_stages(
     views, poses, model, follow, vague = volume_stage(shots, views, poses, others, on_axes, run, options, seed)
     rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
-        values = dense_values(model.grid)
+        built, gone = dense_values(model.grid), 0.0
+        values = built
+        if "unseen" not in options.without:
+            values, gone = closed_where_unseen(built, views, poses)
+        if gone:
+            run.say(f"note: all views are from one side; the shape of the other is a guess ({gone:.0%} less than silhouettes allow)")
         mesh = extract_mesh(values, faces=options.faces)
         cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
         mesh, loose = without_loose_parts(mesh, cameras, [v.mask for v in views], [v.known for v in views])
@@ -79,9 +86,10 @@ def shape_stages(
         rows = row_features(model.grid)
         scene = related(views, poses)
         to_first = scene.motions if len(scene.motions) > 1 else [np.eye(4)]
+        told = told_at(mesh.vertices, extract_mesh(built, faces=options.faces).vertices, built.shape[0]) if gone else mesh.vertices
         seen = [
             instance_radiance(
-                model.grid, rows, model.reflections, mesh.vertices, mesh.normals, motion_or_none(to_first[v.photo]) @ np.linalg.inv(p), k
+                model.grid, rows, model.reflections, told, mesh.normals, motion_or_none(to_first[v.photo]) @ np.linalg.inv(p), k
             )
             for k, (v, p) in enumerate(zip(views, poses, strict=True))
         ]
@@ -105,6 +113,13 @@ def shape_stages(
         }
         stage.save("mesh", **parts)
     return parts
+
+
+def told_at(vertices: np.ndarray, built: np.ndarray, nodes: int) -> np.ndarray:
+    """(V, 3) where the volume pass knows how the vertices look: there, or in the surface that it has built (V', 3) where this is farther
+    away than two of its nodes, as the shape was made smaller there."""
+    away, nearest = cKDTree(built).query(vertices)
+    return np.where((away > 4 / (nodes - 1))[:, None], built[nearest], vertices).astype(vertices.dtype)
 
 
 def parts_of(mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndarray]) -> dict[str, np.ndarray]:

@@ -40,7 +40,7 @@ ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "
 JOINT = ("joint", *(f"joint_{k}" for k in range(2, 2 * PASSES + 1)))  # their stages
 WORSE = 1.1  # times the others' error with those who have joined, and these are out again
 ARRIVED = 0.5  # degrees; a pass that turns the instances by less was the last one
-CLOSE, CLOSER = 0.25, 0.8  # so was one that leaves textures within these pixels, or within so much of what the one before left
+CLOSE, CLOSER = 0.25, 0.9  # so was one that leaves textures within these pixels, or not even a tenth closer than the one before
 
 
 Seek = Callable[[list[View], np.ndarray, np.ndarray, VolumeModel, Mesh, float], dict[int, np.ndarray]]  # see `fit.found_again.joiners`
