@@ -292,6 +292,7 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     _, _, arrived, last = passes((2, 3.0), (2, 0.2))
     assert arrived and last.exact and len(asked) == 2, "textures lie on one another"
     assert passes((2, 0.6), (2, 0.55))[2] and len(asked) == 2, "textures come no closer"
+    assert passes((2.4, 0.32), (0.8, 0.28), (0.4, 0.17))[2] and len(asked) == 3, "an eighth closer is still on the way"
     assert passes((0.1, 0.2, True), (2, 0.3), (2, 0.2))[2] and len(asked) == 3, "what was mixed tells nothing of what follows"
     assert not passes((2, 3.0), (2, 2.0), (2, 1.0), (2, 0.5))[2] and len(asked) == pose_passes.PASSES, "still on their way"
 
