@@ -114,6 +114,15 @@ def test_nothing_changes_where_views_look_from_all_around():
     assert after is hull
 
 
+def test_what_is_too_thin_for_the_coarse_grid_stays():
+    _, _, views, poses = scene_of(ball, ABOVE)
+    y = node_positions(193)[..., 1]
+    thin = np.abs(y) - 0.4 * 2 / 192  # one layer of nodes, between those of the coarse grid
+    thin = np.maximum(thin, np.abs(node_positions(193)[..., [0, 2]]).max(-1) - 0.5).astype(np.float32)
+    assert thin.min() < 0
+    assert closed_where_unseen(thin, views, poses)[1] == 0
+
+
 def test_who_sees_what():
     truth, _, views, poses = scene_of(ball, ABOVE)
     mesh = extract_mesh(truth)

@@ -33,9 +33,11 @@ BLEND = 1.5  # grid steps, standard deviation of what smooths the new surface
 
 def closed_where_unseen(values: np.ndarray, views: list[View], poses: np.ndarray) -> tuple[np.ndarray, float]:
     """(signed distance (n, n, n), share of the volume that is gone) of the shape `values` (n, n, n, negative inside) with the sides that no
-    view shows closed over what is seen; as it is where views look from all around. poses: (N, 4, 4) object_from_photo of the views, in the
-    unit frame."""
+    view shows closed over what is seen; as it is where views look from all around, or it is too thin to tell. poses: (N, 4, 4)
+    object_from_photo of the views, in the unit frame."""
     coarse = resample(values, NODES)
+    if coarse.min() >= 0:  # too thin for that grid
+        return values, 0.0
     mesh = extract_mesh(coarse)  # not decimated: neighbours lie at even distances
     seen, areas = seen_in(mesh, views, poses), face_areas(mesh)
     if areas[~seen].sum() < ONE_SIDED * areas.sum() or not seen.any():
