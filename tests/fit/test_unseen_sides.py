@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from relit.cameras.se3 import look_at
-from relit.fit.duplicates_shape import told_at
 from relit.fit.instances import View
-from relit.fit.unseen_sides import closed_where_unseen, hidden_sky, seen_in
+from relit.fit.unseen_sides import closed_where_unseen, hidden_sky, moved_along, seen_in, told_at
 from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh, face_areas
 from relit.geometry.sdf import node_positions, redistance
@@ -153,3 +152,14 @@ def test_looks_come_from_the_surface_that_was_built():
     built = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
     vertices = np.array([[0.01, 0, 0], [0.8, 0, 0]], np.float32)
     np.testing.assert_allclose(told_at(vertices, built, 101), [[0.01, 0, 0], [1, 0, 0]])
+
+
+def test_a_closed_shape_moves_with_what_was_built():
+    mesh = extract_mesh(ball(node_positions(40)).astype(np.float32))
+    built = mesh.vertices
+    placed = (1.02 * built + np.array([0.01, -0.02, 0.03])).astype(np.float32)
+    chosen = np.arange(0, len(built), 3)
+    moved = moved_along(mesh, built[chosen], placed[chosen])
+    np.testing.assert_allclose(moved.vertices[chosen], placed[chosen], atol=1e-6)
+    np.testing.assert_allclose(moved.vertices, placed, atol=2e-3)
+    assert moved.faces is mesh.faces

@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from relit.fit.duplicates_options import DuplicatesOptions
 from relit.fit.duplicates_poses import Shot
@@ -31,7 +30,7 @@ from relit.fit.pose_passes import (
     shape_and_poses,
 )
 from relit.fit.round_bodies import made_round
-from relit.fit.unseen_sides import closed_where_unseen
+from relit.fit.unseen_sides import closed_where_unseen, moved_along, told_at
 from relit.fit.vessel_trial import vessel_of
 from relit.fit.vessels import body_axis
 from relit.geometry.atlas import unwrap
@@ -60,33 +59,14 @@ def shape_stages(
     views, poses, model, follow, vague = volume_stage(shots, views, poses, others, on_axes, run, options, seed)
     rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
-        built, gone = dense_values(model.grid), 0.0
-        values = built
-        if "unseen" not in options.without:
-            values, gone = closed_where_unseen(built, views, poses)
-        if gone:
-            run.say(f"note: all views are from one side; the shape of the other is a guess ({gone:.0%} less than silhouettes allow)")
-        mesh = extract_mesh(values, faces=options.faces)
-        cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
-        mesh, loose = without_loose_parts(mesh, cameras, [v.mask for v in views], [v.known for v in views])
-        if loose:
-            run.say(f"left out of the shape: {loose} loose part{'s' * (loose > 1)} that no silhouette asks for")
-        if follow is not None:
-            mesh, poses, _ = follow(mesh, views, poses, run, options)
-        if follow is not placed_by_outlines:  # where textures lie on one another, poses have left no bumps
-            mesh = made_round(mesh, views, poses, run, options)
-        if vague:
-            there, turned = [v for v, _ in vague], np.array([p for _, p in vague])
-            if follow is not None:
-                _, turned, _ = placed_by_outlines(mesh, there, turned, run, options, still=True)
-            views, poses = [*views, *there], np.concatenate([poses, turned])
+        mesh, views, poses, values, placed = placed_surface(dense_values(model.grid), views, poses, follow, vague, run, options)
         mesh, how = unwrap(mesh, options.texture)
         if how != "xatlas":
             run.say("note: the mesh was too difficult for charts; its atlas has one cell for every two faces")
         rows = row_features(model.grid)
         scene = related(views, poses)
         to_first = scene.motions if len(scene.motions) > 1 else [np.eye(4)]
-        told = told_at(mesh.vertices, extract_mesh(built, faces=options.faces).vertices, built.shape[0]) if gone else mesh.vertices
+        told = mesh.vertices if placed is None else told_at(mesh.vertices, placed, len(values))
         seen = [
             instance_radiance(
                 model.grid, rows, model.reflections, told, mesh.normals, motion_or_none(to_first[v.photo]) @ np.linalg.inv(p), k
@@ -115,11 +95,34 @@ def shape_stages(
     return parts
 
 
-def told_at(vertices: np.ndarray, built: np.ndarray, nodes: int) -> np.ndarray:
-    """(V, 3) where the volume pass knows how the vertices look: there, or in the surface that it has built (V', 3) where this is farther
-    away than two of its nodes, as the shape was made smaller there."""
-    away, nearest = cKDTree(built).query(vertices)
-    return np.where((away > 4 / (nodes - 1))[:, None], built[nearest], vertices).astype(vertices.dtype)
+def placed_surface(values: np.ndarray, views: list[View], poses: np.ndarray, follow, vague, run, options: DuplicatesOptions):
+    """(mesh, views, poses, values, placed) of the shape `values` (n, n, n), with mesh and poses where outlines and textures have them, and
+    the vague ones (see `volume_stage`) among the views. values, placed: where the mesh is closed over what is seen, the distances of that
+    and the vertices (V', 3) of what the volume pass has built; else as they were, and None."""
+    cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
+    masks, known = [v.mask for v in views], [v.known for v in views]
+    mesh, loose = without_loose_parts(extract_mesh(values, faces=options.faces), cameras, masks, known)
+    if loose:
+        run.say(f"left out of the shape: {loose} loose part{'s' * (loose > 1)} that no silhouette asks for")
+    built, gone = mesh.vertices, 0.0
+    if "unseen" not in options.without:
+        values, gone = closed_where_unseen(values, views, poses)
+    if gone:
+        run.say(f"note: all views are from one side; the shape of the other is a guess ({gone:.0%} less than silhouettes allow)")
+        closed, _ = without_loose_parts(extract_mesh(values, faces=options.faces), cameras, masks, known)
+    if follow is not None:
+        mesh, poses, _ = follow(mesh, views, poses, run, options)
+    if follow is not placed_by_outlines:  # where textures lie on one another, poses have left no bumps
+        mesh = made_round(mesh, views, poses, run, options)
+    if vague:
+        there, turned = [v for v, _ in vague], np.array([p for _, p in vague])
+        if follow is not None:
+            _, turned, _ = placed_by_outlines(mesh, there, turned, run, options, still=True)
+        views, poses = [*views, *there], np.concatenate([poses, turned])
+    if not gone:
+        return mesh, views, poses, values, None
+    placed = mesh.vertices  # poses have followed what silhouettes have made, not the guess
+    return moved_along(closed, built, placed), views, poses, values, placed
 
 
 def parts_of(mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndarray]) -> dict[str, np.ndarray]:

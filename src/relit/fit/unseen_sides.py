@@ -9,6 +9,8 @@ A half would be flat from rim to rim; a third bulges under a round rim by .35 of
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
@@ -27,7 +29,8 @@ AROUND = 60  # neighbours that decide with a face whether it is seen: the rim mu
 SMALL = 0.01  # of the area: smaller parts are as what is around them
 ONE_SIDED = 0.25  # of the surface that nobody sees, from which on; where views look from all sides silhouettes bound the rest
 HIDDEN = 1 / 3  # of the sky
-SKIN = 0.03  # unit lengths under a seen surface that stay, so that thin parts do and every ray of a silhouette meets them
+SKIN = 3  # grid steps under a seen surface that stay, so that thin parts do and every ray of a silhouette meets them
+NEAR = 6  # vertices that tell how one next to them moves
 BLEND = 1.5  # grid steps, standard deviation of what smooths the new surface
 
 
@@ -44,8 +47,8 @@ def closed_where_unseen(values: np.ndarray, views: list[View], poses: np.ndarray
         return values, 0.0
     inside = values < 0
     gone = inside & (resample(hidden_sky(mesh, seen, coarse), len(values)) < HIDDEN)
-    points = node_positions(len(values))[gone]
-    gone[gone] = np.isinf(cKDTree(samples(mesh, seen)).query(points, distance_upper_bound=SKIN)[0])
+    points, step = node_positions(len(values))[gone], 2 / (len(values) - 1)
+    gone[gone] = np.isinf(cKDTree(samples(mesh, seen)).query(points, distance_upper_bound=SKIN * step)[0])
     share = float(gone.sum() / inside.sum())
     if share == 0:
         return values, 0.0
@@ -88,6 +91,21 @@ def hidden_sky(mesh: Mesh, seen: np.ndarray, values: np.ndarray) -> np.ndarray:
         squared = (q**2).sum(1) - 2 * some @ q.T + (some**2).sum(1)[:, None]
         share[at[k : k + 512]] = (across / np.maximum(squared, step**2 / 4) ** 1.5).sum(1) / (4 * np.pi)
     return share.reshape(n, n, n)
+
+
+def moved_along(mesh: Mesh, built: np.ndarray, placed: np.ndarray) -> Mesh:
+    """The mesh, its vertices moved as those of another one next to them: from built (V', 3) to placed (V', 3)."""
+    away, near = cKDTree(built).query(mesh.vertices, NEAR)
+    weight = 1 / np.maximum(away, 1e-6) ** 2
+    shift = (weight[..., None] * (placed - built)[near]).sum(1) / weight.sum(1, keepdims=True)
+    return replace(mesh, vertices=(mesh.vertices + shift).astype(np.float32))
+
+
+def told_at(vertices: np.ndarray, built: np.ndarray, nodes: int) -> np.ndarray:
+    """(V, 3) where the volume pass knows how the vertices look: there, or in the surface that it has built (V', 3) where this is farther
+    away than two of its nodes, as the shape was made smaller there."""
+    away, nearest = cKDTree(built).query(vertices)
+    return np.where((away > 4 / (nodes - 1))[:, None], built[nearest], vertices).astype(vertices.dtype)
 
 
 def twice_areas(corners: np.ndarray) -> np.ndarray:
