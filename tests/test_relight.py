@@ -11,7 +11,7 @@ from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals
 from relit.images import read_image, write_linear
 from relit.lighting.spherical_gaussians import SphericalGaussians, write_json
-from relit.relight import orbit, relight
+from relit.relight import orbit, relight, seen_from
 from relit.scene import Asset, Camera, Material, Mesh
 
 TURN = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)  # world +Z is the asset's up
@@ -104,6 +104,18 @@ def test_turntable_holds_the_object_in_view(asset):
         assert up[1, 1] < up[0, 1]  # world +Z, the asset's up, is up in the picture
         assert np.linalg.det(camera.world_from_camera[:3, :3]) == pytest.approx(1)
     assert len({tuple(np.round(c.centre, 6)) for _, c in views}) == 5
+
+
+def test_the_object_from_above_and_from_below(asset):
+    middle, up = np.array([5.0, 6, 7]), np.array([0, 0, 1.0])  # the asset's up is the world's +Z
+    for elevation, sign in ((90, 1), (-90, -1)):
+        camera = seen_from(asset, 0, elevation, 64)
+        away = camera.centre - middle
+        np.testing.assert_allclose(away / np.linalg.norm(away), sign * up, atol=1e-6)
+        xy = camera.project(asset.mesh.vertices @ (0.1 * TURN).T + middle)
+        assert (xy[:, 2] > 0).all()
+        assert ((xy[:, :2] > 0) & (xy[:, :2] < 64)).all()
+        assert np.linalg.det(camera.world_from_camera[:3, :3]) == pytest.approx(1)
 
 
 def test_sizes_exr_scale_and_a_camera_file(run, asset, from_above, tmp_path):

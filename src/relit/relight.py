@@ -114,21 +114,23 @@ def _scaled(material: Material, scale) -> Material:
 
 def orbit(asset: Asset, count: int, size: int = ORBIT_SIZE) -> list[tuple[str, Camera]]:
     """A turntable: `count` square views round the object's up that hold its bounding sphere, in the world frame."""
+    return [(f"{i:04d}", seen_from(asset, 360 * i / count, ORBIT_ELEVATION, size)) for i in range(count)]
+
+
+def seen_from(asset: Asset, azimuth: float, elevation: float, size: int = ORBIT_SIZE) -> Camera:
+    """A square view that holds the object's bounding sphere, in the world frame. azimuth: degrees round the object's up, from +Z towards
+    +X. elevation: degrees above its horizon, -90 to 90."""
     low, high = asset.mesh.vertices.min(0), asset.mesh.vertices.max(0)
     centre = (low + high).astype(np.float64) / 2
     radius = max(float(np.linalg.norm(asset.mesh.vertices - centre, axis=1).max()), 1e-9)
-    half, elevation = np.radians(ORBIT_FIELD / 2), np.radians(ORBIT_ELEVATION)
+    half, a, e = np.radians([ORBIT_FIELD / 2, azimuth, elevation])
     distance, focal = 1.05 * radius / np.sin(half), 0.5 * size / np.tan(half)
-    out = []
-    for i in range(count):
-        a = 2 * np.pi * i / count
-        back = np.array([np.sin(a) * np.cos(elevation), np.sin(elevation), np.cos(a) * np.cos(elevation)])
-        right = np.array([np.cos(a), 0, -np.sin(a)])
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(-back, right), -back], 1)
-        pose[:3, 3] = centre + distance * back
-        out.append((f"{i:04d}", Camera(size, size, focal, focal, size / 2, size / 2, move_pose(asset.world_from_asset, pose))))
-    return out
+    back = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+    right = np.array([np.cos(a), 0, -np.sin(a)])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(-back, right), -back], 1)
+    pose[:3, 3] = centre + distance * back
+    return Camera(size, size, focal, focal, size / 2, size / 2, move_pose(asset.world_from_asset, pose))
 
 
 def _views(asset: Asset, which: str | Path, size: int | None) -> list[tuple[str, Camera]]:

@@ -19,7 +19,7 @@ from relit.evaluate.curves import ball_of, bars, camera_plot, curve
 from relit.files import parse_toml, read_json, write_text
 from relit.images import encode_jpeg
 from relit.log import readable_bytes, readable_seconds
-from relit.relight import orbit
+from relit.relight import orbit, seen_from
 from relit.rendering.flash_scene import build_flash_scene, render_maps
 from relit.rendering.mitsuba_scene import build_scene, render, render_channels
 from relit.rendering.photographed import lit_scene
@@ -145,6 +145,7 @@ def _light(asset: Asset) -> str:
 
 def _turntables(asset: Asset) -> str:
     cameras = [camera for _, camera in orbit(asset, STILLS, SIDE)]
+    cameras += [seen_from(asset, 0, elevation, SIDE) for elevation in (90, -90)]  # the side below is often a guess, and easily overlooked
     cells = []
     lights = {"a studio of formulas": studio(64), "an evening of formulas": evening(64)}
     for name, light in lights.items():
@@ -153,11 +154,12 @@ def _turntables(asset: Asset) -> str:
         stills = [render(scene, c, spp=SPP) for c in cameras]
         covered = np.concatenate([s[s[..., 3] > 0.5][:, :3].ravel() for s in stills])
         k = 0.9 / max(float(np.percentile(covered, 99)), 1e-6) if covered.size else 1.0
-        strip = np.concatenate([s[..., :3] * k + BACKDROP * (1 - s[..., 3:]) for s in stills], axis=1)
-        picture = f'<img alt="" src="{_uri(strip)}">'
+        stills = [s[..., :3] * k + BACKDROP * (1 - s[..., 3:]) for s in stills]
+        picture = f'<img alt="" src="{_uri(np.concatenate(stills[:STILLS], axis=1))}">'
         frame = f'<div class=turn style="width:{SIDE}px;height:{SIDE}px">{picture}</div>'
         cells.append(f"<figure>{frame}<figcaption>{escape(name)}</figcaption></figure>")
-        cells.append(_figure(_scaled(np.concatenate([strip[:, i * SIDE : (i + 1) * SIDE] for i in (0, 4, 8)], 1), 3 * 200), "stills of it"))
+        some = np.concatenate([*(stills[STILLS * i // 3] for i in range(3)), *stills[STILLS:]], 1)
+        cells.append(_figure(_scaled(some, 5 * 200), "stills of it; from above; from below"))
     plastic = "<p>With the metallic-roughness material of object.glb, which stands for the rough plastic.</p>" if asset.flash else ""
     return f"<div class=row>{''.join(cells)}</div>{plastic}"
 
