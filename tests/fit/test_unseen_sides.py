@@ -75,7 +75,7 @@ def lowest(values):
     return float(node_positions(NODES)[..., 1][values < 0].min())
 
 
-@pytest.mark.parametrize("body, share, below", [(ball, 0.6, 0.35), (slab, 0.2, 0.15)])
+@pytest.mark.parametrize("body, share, below", [(ball, 0.5, 0.35), (slab, 0.2, 0.15)])
 def test_what_hangs_below_goes_where_all_look_down(body, share, below):
     truth, hull, views, poses = scene_of(body, ABOVE)
     before = wrong(hull, truth)
@@ -95,15 +95,15 @@ def test_what_is_seen_stays_where_it_is():
     assert away.max() < 1e-4
 
 
-@pytest.mark.parametrize("body", [ball, slab, two_legs])
-def test_every_ray_of_a_silhouette_still_meets_the_body(body):
+@pytest.mark.parametrize("body, lost", [(ball, 0.01), (slab, 0.01), (two_legs, 0.02)])
+def test_every_ray_of_a_silhouette_still_meets_the_body(body, lost):
     _, hull, views, poses = scene_of(body, ABOVE)
     after, gone = closed_where_unseen(hull, views, poses)
     assert gone > 0
     scenes = [build_geometry(extract_mesh(values)) for values in (hull, after)]
     for view, pose in zip(views, poses, strict=True):
         before, now = (mask_of(scene, view.camera.with_pose(pose)) for scene in scenes)
-        assert ((before > now) & (view.mask > 0)).sum() < 0.02 * view.mask.sum()
+        assert ((before > now) & (view.mask > 0)).sum() < lost * view.mask.sum()
 
 
 def test_nothing_changes_where_views_look_from_all_around():

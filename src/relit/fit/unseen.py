@@ -44,9 +44,15 @@ def seen_faces(mesh: Mesh, cameras: list[Camera], cosine: float = 0.0) -> np.nda
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    points = np.concatenate([corners.mean(1, keepdims=True), 0.7 * corners + 0.3 * corners.mean(1, keepdims=True)], 1)
-    seen = seen_points(build_geometry(mesh), points.reshape(-1, 3), np.repeat(normals, 4, axis=0), cameras, cosine)
+    points = points_on(corners).reshape(-1, 3)
+    seen = seen_points(build_geometry(mesh), points, np.repeat(normals, 4, axis=0), cameras, cosine)
     return seen.reshape(-1, 4).any(1)
+
+
+def points_on(corners: np.ndarray) -> np.ndarray:
+    """(F, 4, 3) of triangles (F, 3, 3): their middles, and a point near each of their corners."""
+    middle = corners.mean(1, keepdims=True)
+    return np.concatenate([middle, 0.7 * corners + 0.3 * middle], 1)
 
 
 def seen_points(scene: mi.Scene, points: np.ndarray, normals: np.ndarray, cameras: list[Camera], cosine: float = 0.0) -> np.ndarray:

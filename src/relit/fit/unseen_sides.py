@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
 from relit.fit.instances import View
-from relit.fit.unseen import face_pairs, part_areas, seen_points
+from relit.fit.unseen import face_pairs, part_areas, points_on, seen_points
 from relit.geometry.hull import distance_of
 from relit.geometry.mesh import extract_mesh, face_areas
 from relit.geometry.sdf import node_positions, resample
@@ -47,8 +47,9 @@ def closed_where_unseen(values: np.ndarray, views: list[View], poses: np.ndarray
         return values, 0.0
     inside = values < 0
     gone = inside & (resample(hidden_sky(mesh, seen, coarse), len(values)) < HIDDEN)
+    on_seen = points_on(mesh.vertices[mesh.faces[seen]].astype(np.float64))
     points, step = node_positions(len(values))[gone], 2 / (len(values) - 1)
-    gone[gone] = np.isinf(cKDTree(samples(mesh, seen)).query(points, distance_upper_bound=SKIN * step)[0])
+    gone[gone] = np.isinf(cKDTree(on_seen.reshape(-1, 3)).query(points, distance_upper_bound=SKIN * step)[0])
     share = float(gone.sum() / inside.sum())
     if share == 0:
         return values, 0.0
@@ -111,10 +112,3 @@ def told_at(vertices: np.ndarray, built: np.ndarray, nodes: int) -> np.ndarray:
 def twice_areas(corners: np.ndarray) -> np.ndarray:
     """(F, 3) normals of triangles (F, 3, 3), twice their areas long."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def samples(mesh: Mesh, seen: np.ndarray) -> np.ndarray:
-    """(P, 3) points of the seen faces, four in each."""
-    corners = mesh.vertices[mesh.faces[seen]].astype(np.float64)
-    middle = corners.mean(1, keepdims=True)
-    return np.concatenate([middle, 0.7 * corners + 0.3 * middle], 1).reshape(-1, 3)
