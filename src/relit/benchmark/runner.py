@@ -29,14 +29,15 @@ def run_suite(
     assets: str | Path | None = None,
     objects: Sequence[str] = (),
     out: str | Path | None = None,
-    spp: int = 256,
+    spp: int | None = None,
     seed: int = 0,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Synthesize, reconstruct and evaluate every object of a suite, plain and with each ablation.
 
     assets: folder with `assets` and `envmaps`. objects: names to limit the suite to. ablate: names of the suite's ablations or `key=value`.
-    out: folder for the runs and the results, by default a new one in the cache. spp: samples a pixel when the result is rendered.
+    out: folder for the runs and the results, by default a new one in the cache. spp: samples a pixel of the compared
+    pictures, by default as many as `relit evaluate` takes.
     Returns {"suite", "quality", "device", "machine", "runs": {variant: {object: {"metrics", ...}}}, "means": {variant: {figure: value}}}.
     """
     from relit.device import use_device
@@ -47,7 +48,7 @@ def run_suite(
     used = use_device(device)
     folder = Path(out) if out else store / "runs" / f"{suite}-{quality}-{time.strftime('%Y%m%d-%H%M%S')}"
     captures = {item.name: synthesize_item(spec, item, data, store, say) for item in items}
-    evaluate = named(spec.evaluate)
+    evaluate, samples = named(spec.evaluate), {} if spp is None else {"spp": spp}
 
     result: dict[str, Any] = {
         "suite": suite,
@@ -68,7 +69,7 @@ def run_suite(
             say(f"{name} ({variant}): {' '.join(command[1:])}")
             seconds, memory = timed(command, folder / "logs" / f"{run.name}.txt")
             say(f"{name} ({variant}): {seconds:.0f} s, {memory:.2f} GB; evaluating")
-            entry = evaluate(run, capture, spp=spp)
+            entry = evaluate(run, capture, **samples)
             costs = entries({"seconds": seconds, "peak_memory": memory}, COST_DEFINITIONS)
             entry["metrics"] = {**costs, **entry["metrics"]}
             result["runs"][variant][name] = {**entry, "run": run.name, "capture": capture.name}
