@@ -81,3 +81,12 @@ def test_look_at_is_opencv():
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
     down = se3.look_at([0, 3, 0], [0, 0, 0])
     np.testing.assert_allclose(down[:3, :3] @ down[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_several_cameras_look_as_each_alone():
+    eyes = np.array([[0, 0, -3.0], [0.1, 3, 0.5], [1, -2, 0.5]])  # the second looks along `up`
+    at, up, roll = [0.1, 0.0, 0.2], [0, 1, 0.1], 0.3
+    together = se3.look_at(eyes, at, up, roll)
+    np.testing.assert_allclose(together, [se3.look_at(e, at, up, roll) for e in eyes], atol=1e-15)
+    np.testing.assert_allclose(together[:, :3, 3], eyes)
+    np.testing.assert_allclose(np.linalg.det(together[:, :3, :3]), 1)

@@ -99,6 +99,25 @@ def test_eikonal_gradient_against_finite_differences():
     assert dense_values(grid).shape == (12, 12, 12)
 
 
+@pytest.mark.parametrize("band", [1.5, np.inf])
+def test_eikonal_gradient_of_a_narrow_band(band):
+    """Each node of the band passes its slope on to those of its neighbours that lie in the band."""
+    import drjit as dr
+    import mitsuba as mi
+
+    n, rng = 10, np.random.default_rng(1)
+    values = (ball(n, 0.6) + 0.02 * rng.normal(size=(n, n, n))).astype(np.float32)
+    grid = make_grid(values, 4, band=band)
+    inside = np.isin(np.arange(n**3), np.array(grid.nodes)).reshape(n, n, n)
+    inner = inside & (np.pad(np.ones((n - 2,) * 3), 1) > 0)
+    steps = [(np.roll(values, -1, axis) - np.roll(values, 1, axis)) / (2 * grid.h) for axis in range(3)]
+    weight = 2 / inside.sum() * (1 - 1 / np.maximum(np.sqrt(sum(s**2 for s in steps)), 0.05)) * inner / (2 * grid.h)
+    expected = sum(np.roll(weight * s, 1, axis) - np.roll(weight * s, -1, axis) for axis, s in enumerate(steps))
+    slope = np.array(smoothness_gradient(grid, dr.opaque(mi.Float, 1.0))[0])
+    assert slope[0] == 0
+    np.testing.assert_allclose(slope[1:], expected.ravel()[np.array(grid.nodes)], atol=1e-5 * np.abs(expected).max())
+
+
 def test_fused_depths_give_the_ball_back():
     cameras = views(24)
     depths = [np.minimum(ball_depth(c, 0.6), 10.0) for c in cameras]

@@ -110,17 +110,23 @@ def camera_errors(a_from_camera: np.ndarray, b_from_camera: np.ndarray, robust: 
 
 
 def look_at(eye, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), roll: float = 0.0) -> np.ndarray:
-    """(4, 4) world_from_camera, OpenCV axes, at `eye` looking at `target`, `up` upwards in the image; roll in radians about its axis."""
+    """(..., 4, 4) world_from_camera, OpenCV axes, at `eye` (..., 3) looking at `target`, `up` upwards in the image; roll in radians about
+    its axis."""
     eye, up = np.asarray(eye, dtype=np.float64), np.asarray(up, dtype=np.float64)
-    z = np.asarray(target, dtype=np.float64) - eye
-    z = z / np.linalg.norm(z)
+
+    def unit(v):
+        return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+    z = unit(np.asarray(target, dtype=np.float64) - eye)
     x = np.cross(z, up)
-    if np.linalg.norm(x) < 1e-6:  # looks along `up`: any other direction will do
-        x = np.cross(z, np.roll(up, 1))
-    x = x / np.linalg.norm(x)
+    upright = np.linalg.norm(x, axis=-1, keepdims=True) >= 1e-6
+    x = unit(np.where(upright, x, np.cross(z, np.roll(up, 1))))  # looks along `up`: any other direction will do
     y = np.cross(z, x)
     c, s = np.cos(roll), np.sin(roll)
-    return similarity(np.stack([c * x + s * y, c * y - s * x, z], axis=1), eye)
+    out = np.zeros((*eye.shape[:-1], 4, 4))
+    out[..., :3, :] = np.stack([c * x + s * y, c * y - s * x, z, eye], axis=-1)
+    out[..., 3, 3] = 1
+    return out
 
 
 def turns_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:

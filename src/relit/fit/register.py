@@ -14,7 +14,9 @@ may be unknown (outside the frame, behind something else): they carry weight 0.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import cv2
@@ -170,7 +172,7 @@ def directions_around(count: int, seed: int = 0) -> np.ndarray:
 def views_from(directions: np.ndarray, distance: float = 3.0, side: int = SIDE) -> list[Camera]:
     """Cameras that look at the origin from `directions` (V, 3), the unit sphere just in frame, +y up in the picture."""
     focal = 0.5 * side * np.sqrt(distance**2 - 1)
-    return [Camera(side, side, focal, focal, side / 2, side / 2, look_at(d * distance)) for d in directions]
+    return [Camera(side, side, focal, focal, side / 2, side / 2, pose) for pose in look_at(directions * distance)]
 
 
 def make_gallery(render: Render, cameras: list[Camera], parts=PARTS) -> Gallery:
@@ -193,7 +195,8 @@ def rings_of(rgb: np.ndarray, mask: np.ndarray, weight: np.ndarray | None = None
     if len(mask) > AT_ONCE:
         given = (rgb, mask, weight, centre, spread)
         some = [[None if a is None else a[k : k + AT_ONCE] for a in given] for k in range(0, len(mask), AT_ONCE)]
-        rings = [rings_of(*each, parts=parts) for each in some]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # OpenCV and NumPy let go of the interpreter
+            rings = list(pool.map(lambda each: rings_of(*each, parts=parts), some))
         return Rings(*(np.concatenate([getattr(r, f.name) for r in rings]) for f in fields(Rings)))
     mask = np.asarray(mask, np.float32)
     known = mask if weight is None else mask * weight

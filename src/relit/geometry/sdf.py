@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+MOST_COPIES = 1 << 23  # numbers, of all threads; see `sums_into`
+
 
 @dataclass
 class SdfGrid:
@@ -135,14 +137,28 @@ def smoothness_gradient(grid: SdfGrid, eikonal):
     norm = dr.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
     ke = eikonal * (2.0 / count) * (1 - 1 / dr.maximum(norm, 0.05))
     around = pairs[0][0] + pairs[0][1] + pairs[1][0] + pairs[1][1] + pairs[2][0] + pairs[2][1]
-    out = dr.zeros(mi.Float, grid.rows)
-    for c, (_, _, k) in enumerate(pairs):
-        e = ke * g[c] / (2 * h)
-        dr.scatter_add(out, e, dr.gather(mi.UInt32, grid.index, a + k, ok), ok, mode=dr.ReduceMode.Direct)
-        dr.scatter_add(out, -e, dr.gather(mi.UInt32, grid.index, a - k, ok), ok, mode=dr.ReduceMode.Direct)
-    diffusion = dr.zeros(mi.Float, grid.rows)
-    dr.scatter(diffusion, dr.select(ok, around * (1 / 6) - centre, 0), dr.arange(mi.UInt32, count) + 1)
+    slopes = [dr.select(ok, ke * v / (2 * h), 0) for v in g]
+    rounder = dr.select(ok, around * (1 / 6) - centre, 0)
+    dr.eval(slopes, rounder)
+    pull = sum(neighbour_difference(grid, e, k) for e, (_, _, k) in zip(slopes, pairs, strict=True))
+    own, out, diffusion = dr.arange(mi.UInt32, count) + 1, dr.zeros(mi.Float, grid.rows), dr.zeros(mi.Float, grid.rows)
+    dr.scatter(out, pull, own)
+    dr.scatter(diffusion, rounder, own)
     return out, diffusion
+
+
+def neighbour_difference(grid: SdfGrid, e, k: int):
+    """Float [rows - 1]: e (Float [rows - 1], by node of the band) at the node k before each minus e at the node k after it; 0 outside."""
+    a = grid.nodes
+    before, after = (dr.gather(mi.UInt32, grid.index, node, there) for node, there in ((a - k, a >= k), (a + k, a + k < grid.n**3)))
+    return dr.gather(mi.Float, e, before - 1, before > 0) - dr.gather(mi.Float, e, after - 1, after > 0)
+
+
+def sums_into(entries: int):
+    """The dr.ReduceMode in which sums are scattered into so many numbers. On the CPU each thread adds to a copy of its own where these are
+    few, which is cleared and added to the others' each time; atomic additions need none, but take several times as long each."""
+    few = entries * dr.thread_count() <= MOST_COPIES
+    return dr.ReduceMode.Expand if few and dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Direct
 
 
 def neighbour_mean_difference(grid: SdfGrid, rows):

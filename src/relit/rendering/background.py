@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from relit.rendering.blocks import block_sums
+
 FOG = 0.9  # radius of the fog at the start, unit frame
 
 
@@ -130,7 +132,7 @@ def emission(field: Background, o, d, depths: Depths):
     before = dr.block_prefix_sum(tau, k)  # exclusive
     weight = dr.exp(-before) * (1 - dr.exp(-tau))
     rgb = dr.exp(dr.clip(mi.Color3f(value.y, value.z, value.w), -12, 6))
-    return mi.Color3f(*[dr.block_sum(weight * c, k) for c in (rgb.x, rgb.y, rgb.z)]), density, before
+    return block_sums((weight * rgb,), k)[0], density, before
 
 
 def softplus(x):

@@ -25,7 +25,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from relit.geometry.sdf import SdfGrid
+from relit.geometry.sdf import SdfGrid, sums_into
 
 MAX_STEPS = 600
 MIN_ALPHA = 1e-3  # samples below it contribute nothing and are not shaded
@@ -154,7 +154,7 @@ def _scatter_point(grid, gs, cell, g, g_gradient, active):
                 value = g * (wx * wy * wz)
                 value += g_gradient.x * (sx * wy * wz) + g_gradient.y * (wx * sy * wz) + g_gradient.z * (wx * wy * sz)
                 row = dr.gather(mi.UInt32, grid.index, cell.base + (dz * n + dy) * n + dx, active)
-                dr.scatter_add(gs, value, row, active, mode=dr.ReduceMode.Direct)
+                dr.scatter_add(gs, value, row, active, mode=sums_into(grid.rows))
 
 
 @dr.syntax
@@ -207,7 +207,7 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
             for k in range(packets):
                 gfk = mi.Vector4f(gF[4 * k] * w, gF[4 * k + 1] * w, gF[4 * k + 2] * w, gF[4 * k + 3] * w)
                 for row, weight in zip(rows8, weights, strict=False):
-                    dr.scatter_add(gf, gfk * weight, row * packets + k, shaded, mode=dr.ReduceMode.Direct)
+                    dr.scatter_add(gf, gfk * weight, row * packets + k, shaded, mode=sums_into(grid.rows * grid.channels))
                 gp += _feature_position_gradient(features, rows8, end.f, gfk, packets, k, n)
             go += gp
             gd += gp * tn

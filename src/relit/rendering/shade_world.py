@@ -46,14 +46,11 @@ def in_photo(cameras, view, v):
 
 def shading(n, learnt):
     """S(n) (Color3f) of directions n in the photo's frame."""
-    y = harmonics(n)
-    logs = []
-    for c in range(3):
-        value = mi.Float(0)
-        for k in range(9):
-            value += y[k] * dr.gather(mi.Float, learnt, mi.UInt32(MAP + 3 * k + c))
-        logs.append(value)
-    return dr.exp(mi.Color3f(*logs))
+    log, width = mi.Color3f(0), dr.width(n)
+    for k, y in enumerate(harmonics(n)):
+        # an index for each direction, though all are the same: of a single one the adjoint is a sum, a kernel of its own for each number
+        log += y * dr.gather(mi.Color3f, learnt, dr.full(mi.UInt32, MAP // 3 + k, width))
+    return dr.exp(log)
 
 
 def shade_world(m: Marched, rays, cameras, learnt, turns=None):

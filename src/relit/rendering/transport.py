@@ -19,6 +19,7 @@ import numpy as np
 from relit.geometry.tangents import vertex_tangents
 from relit.lighting.environment import Environment
 from relit.materials.brdf import Surface, evaluate, pdf, sample
+from relit.rendering.blocks import block_sums, repeat
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.rendering.path import SmoothOrigins
 from relit.scene import Mesh
@@ -162,20 +163,12 @@ def reflected(points: Points, lights: Lights, surface: Surface, environment: Env
     Differentiable in the surface's material, in points.n and in environment.radiance. The product of the two residuals is an unbiased
     estimate of the squared error; the square of one estimate would pull towards materials with less noise.
     """
-    point = lights.point
-    n, v = repeat(points.n, lights.count), dr.gather(mi.Vector3f, points.v, point)
-    m = Surface(*[repeat(c, lights.count) for c in (surface.base, surface.roughness, surface.metallic)], surface.f0)
+    v = dr.gather(mi.Vector3f, points.v, lights.point)
+    n, *material = repeat((points.n, surface.base, surface.roughness, surface.metallic), lights.count)
+    m = Surface(*material, surface.f0)
     arriving = environment.eval(lights.l) * lights.visible + lights.blocked
     value = evaluate(m, n, v, lights.l) * arriving * (2 * lights.weight)
     odd = (dr.arange(mi.UInt32, dr.width(lights.weight)) & 1) == 1
     zero = mi.Color3f(0)
     first, second = dr.select(odd, zero, value), dr.select(odd, value, zero)
-    total = lambda c: mi.Color3f(*[dr.block_sum(k, lights.count) for k in (c.x, c.y, c.z)])  # noqa: E731
-    return total(first), total(second)
-
-
-def repeat(value, count: int):
-    """Each entry `count` times; the adjoint is a block sum, not a scatter."""
-    if isinstance(value, mi.Float):
-        return dr.repeat(value, count)
-    return type(value)(*[dr.repeat(c, count) for c in value])
+    return block_sums((first, second), lights.count)
