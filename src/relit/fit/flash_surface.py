@@ -138,7 +138,6 @@ def fit_flash_surface(
         expected = straight + expected_bounce(model, points, plastic, n, batch.view, intensity)
         if o.directions > 0:
             a, b = (straight + bounced(mesh, field, model, points, plastic, n, position, intensity, rng, o) for _ in range(2))
-        dr.eval(a, b, expected)  # once, not for each of the sums that follow
         e = min(1.5 * i / o.steps, 1.0)
         sigma = dr.opaque(mi.Float, o.robust[0] ** (1 - e) * o.robust[1] ** e)
         saturated = saturated_at(bank, batch.view)

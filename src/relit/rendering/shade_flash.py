@@ -20,6 +20,7 @@ import numpy as np
 from relit.lighting.flash import incident, light_position
 from relit.materials.field import nearest_texel
 from relit.materials.rough_plastic import MIN_ALPHA, Coat, Plastic, base_radiance, evaluate
+from relit.rendering.blocks import everywhere
 from relit.rendering.march import Marched, march, sphere_interval
 
 NODES = 24  # of the alpha grid, a side
@@ -77,7 +78,7 @@ class FlashAppearance:
         F = m.features
         n = m.unit_normal
         x = m.surface_point(rays.o, rays.d)
-        offset = mi.Vector3f(*[dr.gather(mi.Float, learnt, mi.UInt32(k)) for k in range(3)])
+        offset = everywhere(mi.Vector3f, learnt, 0, dr.width(x))
         position = light_position(cameras, rays.view, offset)
         l, inverse = incident(position, x)
         alpha = alpha_at(learnt, x)

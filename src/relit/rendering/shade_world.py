@@ -17,6 +17,7 @@ import numpy as np
 
 from relit.lighting.environment import lookup_latlong
 from relit.materials import intrinsic
+from relit.rendering.blocks import everywhere
 from relit.rendering.march import Marched
 from relit.rendering.shade import COLUMNS, ROWS, features_at
 
@@ -46,10 +47,9 @@ def in_photo(cameras, view, v):
 
 def shading(n, learnt):
     """S(n) (Color3f) of directions n in the photo's frame."""
-    log, width = mi.Color3f(0), dr.width(n)
+    log = mi.Color3f(0)
     for k, y in enumerate(harmonics(n)):
-        # an index for each direction, though all are the same: of a single one the adjoint is a sum, a kernel of its own for each number
-        log += y * dr.gather(mi.Color3f, learnt, dr.full(mi.UInt32, MAP // 3 + k, width))
+        log += y * everywhere(mi.Color3f, learnt, MAP // 3 + k, dr.width(n))
     return dr.exp(log)
 
 
