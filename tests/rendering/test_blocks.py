@@ -62,3 +62,23 @@ def test_nothing_is_computed_for_each_sum_again(mi):
         dr.eval(dr.grad(a), dr.grad(b))
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and k["size"] == width]
     assert 1 <= len(kernels) <= 2
+
+
+def test_what_is_the_same_everywhere_has_the_sum_as_its_gradient_and_no_kernel_of_its_own(mi):
+    import drjit as dr
+
+    from relit.rendering.blocks import everywhere
+
+    numbers, width = mi.Float(np.arange(27, dtype=np.float32)), 5000
+    x = dr.arange(mi.Float, width) / width
+    dr.enable_grad(numbers)
+    dr.eval(x, numbers)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        total = sum((x + k) * everywhere(mi.Color3f, numbers, k, width) for k in range(9))
+        dr.backward(total.x + 2 * total.y + 3 * total.z)
+        gradient = np.array(dr.grad(numbers))
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and k["size"] == width]
+    expected = np.array([[c * (np.array(x) + k).sum() for c in (1, 2, 3)] for k in range(9)])
+    np.testing.assert_allclose(gradient.reshape(9, 3), expected, rtol=1e-4)
+    assert 1 <= len(kernels) <= 2
