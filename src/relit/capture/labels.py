@@ -71,8 +71,7 @@ def _from_cutouts(folder: Path, shape: tuple[int, int]) -> np.ndarray:
 def bop_object(truth: dict) -> int:
     """The obj_id of which the first picture of BOP's scene_gt.json shows the most instances."""
     first = truth[min(truth, key=int)]
-    ids = [int(entry["obj_id"]) for entry in first]
-    return max(sorted(set(ids)), key=ids.count)
+    return _commonest([int(entry["obj_id"]) for entry in first])
 
 
 def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
@@ -95,7 +94,42 @@ def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
     return labels
 
 
+def which_objects(source: Path, photo: Path) -> str | None:
+    """A note on which objects count, where the labels speak of several kinds."""
+    if source.name == BOP_TRUTH:
+        return f"the objects are those with obj_id {bop_object(read_json(source))}, the commonest of the scene"
+    if source.suffix.lower() != ".json":
+        return None
+    data = read_json(source)
+    kinds = _coco_kinds(data, photo)
+    if len(set(kinds)) < 2:
+        return None
+    chosen = _commonest(kinds)
+    listed = data.get("categories")
+    names = {c.get("id"): c.get("name") for c in listed if isinstance(c, dict)} if isinstance(listed, list) else {}
+    return f"the objects are those of category {names.get(chosen, chosen)}, the commonest of {len(set(kinds))}; others are left out"
+
+
+def _commonest(kinds: list):
+    return max(sorted(set(kinds)), key=kinds.count)
+
+
+def _coco_kinds(data: dict, photo: Path) -> list[int]:
+    """Category of each annotated object of the photos that lie in the photo's folder, -1 where none is told; groups of objects (iscrowd) do
+    not count."""
+    images = [i for i in data["images"] if isinstance(i, dict)]
+    here = {f.name for f in photo.parent.iterdir()}
+    ids = [i.get("id") for i in images if Path(str(i.get("file_name", ""))).name in here] or [i.get("id") for i in images]
+    return [_coco_kind(a) for a in data["annotations"] if isinstance(a, dict) and a.get("image_id") in ids and not a.get("iscrowd")]
+
+
+def _coco_kind(annotation: dict) -> int:
+    kind = annotation.get("category_id")
+    return kind if isinstance(kind, int) else -1
+
+
 def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Objects of the commonest category."""
     data = read_json(file)
     images = [i for i in data["images"] if isinstance(i, dict)]
     entry = next((i for i in images if Path(str(i.get("file_name", ""))).name == photo.name), None)
@@ -108,8 +142,9 @@ def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
         raise UserError(f"the annotations give the photo {photo.name} the size {size}", fix=f"check `images`: {file}")
     sx, sy = shape[1] / size[1], shape[0] / size[0]
     labels, k = np.zeros(shape, np.int32), 0
+    chosen = _commonest(_coco_kinds(data, photo) or [-1])
     for a in data["annotations"]:
-        if not isinstance(a, dict) or a.get("image_id") != entry.get("id"):
+        if not isinstance(a, dict) or a.get("image_id") != entry.get("id") or a.get("iscrowd") or _coco_kind(a) != chosen:
             continue
         k += 1
         s = a.get("segmentation")

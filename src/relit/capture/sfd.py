@@ -22,7 +22,7 @@ import numpy as np
 
 from relit.capture.corrections import corrected_labels
 from relit.capture.frames import check_max_side, image_folder, list_images, pose_from, read_json
-from relit.capture.labels import BOP_TRUTH, bop_object, checked_labels, read_labels
+from relit.capture.labels import BOP_TRUTH, checked_labels, read_labels, which_objects
 from relit.capture.networks import Network, found_instances
 from relit.capture.photo import Decoder
 from relit.conventions import world_from_cv_camera
@@ -140,8 +140,8 @@ def open_duplicates(source: Source, *, focal: float | None = None, max_side: int
         notes += [named + note for note in (*dropped, f"{count} objects in {labels.name}")]
         objects += count
         photos.append(labelled_photo(source, path, header, own, focal, max_side, notes))
-    if source.labels.name == BOP_TRUTH:
-        notes.append(f"the objects are those with obj_id {bop_object(read_json(source.labels))}, the commonest of the scene")
+    if (told := which_objects(source.labels, source.photo)) is not None:
+        notes.append(told)
     if source.more:
         notes.append(f"{len(photos)} photos of one pile: nothing must stir between them")
     return Capture(source.root, "duplicates", tuple(photos), notes=tuple(dict.fromkeys(notes)), kind="duplicates", objects=objects)
