@@ -1,15 +1,15 @@
 """A photo, changed: another material, of a pile of duplicates an instance taken away, a new object put in, under the recovered light (of a
 collection the photo's own, of a flash capture the flash at that camera).
 
-Differential rendering (Debevec 1998, Sec. 4): where the changed thing itself is seen, the picture is rendered; everywhere else the photo
-stays, plus what the change does to it (render after minus render before): contact shadows and inter-reflections fall on what was
-photographed.
+Where the changed thing itself is seen, the picture is rendered; everywhere else the photo stays, plus what the change does to it
+(`rendering.changed`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +22,9 @@ from relit.errors import EXIT_USAGE, UserError
 from relit.files import digests
 from relit.images import read_image, write_srgb
 from relit.materials.plastic_as_gltf import base_colour, diffuse_albedo
-from relit.rendering.mitsuba_scene import build_scene, render
-from relit.rendering.photographed import as_photographed
+from relit.rendering.changed import change_of
+from relit.rendering.mitsuba_scene import Scene, build_scene, render
+from relit.rendering.photographed import Shower, as_photographed
 from relit.rendering.pile import build_pile, instance_ids, joined
 from relit.scene import Asset, Camera, Material, Mesh
 
@@ -42,12 +43,14 @@ def edit(
     remove: Sequence[int] = (),
     spp: int = 64,
     seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Write an asset folder `out` with another material and without the instances `remove` (labels); with `photo`, also the changed photo,
     `out`/photo.png. Returns what was written.
 
     photo: any of the run's photos, known by its name or its content.
     base_color: (3,) linear, replaces the texture; tint: (3,), multiplies it. roughness, metallic: constants that replace the maps.
+    progress: called with (done, all).
     """
     out, asset = Path(out), load_asset(run)
     _in_range({"roughness": roughness, "metallic": metallic})
@@ -74,15 +77,16 @@ def edit(
     written = [save_asset(out, changed)]
     if photo is not None:
         name, camera, picture = _photo(asset, photo)
-        before, ids = _rendered(asset, name, camera, spp, seed)
-        after, new_ids = _rendered(changed, name, camera, spp, seed)
+        ids, new_ids = _ids(asset, camera), _ids(changed, camera)
         same = material is asset.material
         shown, told = np.array([i.label for i in asset.instances if i.registered] + [0])[ids], _labels_beside(photo, ids.shape)
         if told is not None and name != asset.cameras[0][0]:
             told = as_shown(told, shown)
         gone = cleared(shown, told, remove)
         own = gone if same else gone | (new_ids >= 0)
-        write_srgb(out / "photo.png", np.clip(np.where(own[..., None], after, picture + after - before), 0, 1))
+        shows = [partial(_as_photographed, as_photographed(a), name, spp, seed) for a in (asset, changed)]
+        after, change = change_of(*shows, camera, picture, own, progress=progress)
+        write_srgb(out / "photo.png", np.clip(np.where(own[..., None], after, picture + change), 0, 1))
         written.append(out / "photo.png")
     return written
 
@@ -133,11 +137,13 @@ def insert(
     turn: float = 0.0,
     spp: int = 128,
     seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Put a model (.glb, .gltf, .obj; or an asset folder) into the photo, standing on the ground at pixel `at` (x, y), and write the
     picture `out`.
 
-    photo: any of the run's photos. size: its bounding sphere, in that of the recovered object. turn: degrees about the vertical.
+    photo: any of the run's photos. size: its bounding sphere, in that of the recovered object. turn: degrees about the vertical. progress:
+    called with (done, all).
     """
     asset, out = load_asset(run), Path(out)
     if asset.ground is None or asset.environment is None:
@@ -157,12 +163,13 @@ def insert(
     placed = standing(mesh, asset, camera, at, size, turn)
     poses = [i.world_from_object for i in asset.instances if i.registered]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
-    before = render(build_scene(pile.mesh, pile.material, np.eye(4), asset.environment), camera, spp=spp, seed=seed)[..., :3]
+    before = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
     whole, materials = joined(pile.mesh, pile.material, placed, material)
     scene = build_scene(whole, materials, np.eye(4), asset.environment)
-    after = render(scene, camera, spp=spp, seed=seed)[..., :3]
-    cover = coverage(scene, len(pile.mesh.faces), camera)[..., None]
-    write_srgb(out, np.clip(cover * after + (1 - cover) * (picture + after - before), 0, 1))
+    cover = coverage(scene, len(pile.mesh.faces), camera)
+    shows = [partial(_rendered, s, spp, seed) for s in (before, scene)]
+    after, change = change_of(*shows, camera, picture, cover == 1, cover > 0, progress)
+    write_srgb(out, np.clip(cover[..., None] * after + (1 - cover[..., None]) * (picture + change), 0, 1))
     return out
 
 
@@ -203,23 +210,25 @@ def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.nd
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, 500 + k), pixels)
         with dr.suspend_grad():
-            ray, _ = camera_rays(scene, camera, sampler, pixels)
+            ray, _ = camera_rays(scene, camera, dr.arange(mi.UInt32, pixels), sampler)
             pi = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
             total += (pi.is_valid() & (pi.prim_index >= first_face)).numpy()
     return (total / samples).reshape(camera.height, camera.width)
 
 
-def _rendered(asset: Asset, name: str, camera: Camera, spp: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the photo `name` shows (H, W, 3), under its own light where it has one, and which registered instance each pixel shows, -1 for
-    none."""
+def _rendered(scene: Scene, spp: int, seed: int, camera: Camera, **how) -> np.ndarray:
+    return render(scene, camera, spp=spp, seed=seed, **how)[..., :3]
+
+
+def _as_photographed(show: Shower, name: str, spp: int, seed: int, camera: Camera, **how) -> np.ndarray:
+    return show(name, camera, spp=spp, seed=seed, **how)[..., :3]
+
+
+def _ids(asset: Asset, camera: Camera) -> np.ndarray:
+    """(H, W) which registered instance each pixel shows, -1 for none."""
     poses = [i.world_from_object for i in asset.instances if i.registered] or [asset.world_from_asset]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
-    light = dict(zip((n for n, _ in asset.cameras), asset.lights, strict=False)).get(name, asset.environment)
-    scene = build_scene(pile.mesh, pile.material, np.eye(4), np.ones((8, 16, 3), np.float32) if light is None else light)
-    ids = instance_ids(scene, pile, camera)
-    if asset.flash is not None:
-        return as_photographed(asset)(name, camera, spp=spp, seed=seed)[..., :3], ids
-    return render(scene, camera, spp=spp, seed=seed)[..., :3], ids
+    return instance_ids(build_scene(pile.mesh, pile.material, np.eye(4)), pile, camera)
 
 
 def _labels_beside(photo: str | Path, shape: tuple[int, int]) -> np.ndarray | None:

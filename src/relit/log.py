@@ -9,6 +9,8 @@ import resource
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
@@ -100,6 +102,19 @@ class Progress:
                 parts.append(f"{readable_seconds((self.steps - done) / self._rate)} left")
         parts += [f"{name} {value:.4g}" for name, value in values.items()]
         return "  ".join(parts)
+
+
+@contextmanager
+def counted(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Gives what is to be called with (done, all) and shows it as a progress line; all may change."""
+    progress = Progress(Log(), title, None)
+
+    def show(done: int, count: int) -> None:
+        progress.steps = count
+        progress.update(done)
+
+    yield show
+    progress.log.clear()
 
 
 def readable_seconds(seconds: float) -> str:

@@ -19,7 +19,7 @@ from relit.errors import UserError
 from relit.lighting.flash import flash_position
 from relit.materials import rough_plastic
 from relit.rendering.bsdf import shading_normal
-from relit.rendering.mitsuba_scene import camera_rays, mitsuba_mesh, mitsuba_texture, moved_mesh, sample_passes, unit_ball
+from relit.rendering.mitsuba_scene import as_picture, mitsuba_mesh, mitsuba_texture, moved_mesh, sample_sums, unit_ball
 from relit.scene import Camera, Flash, Material, Mesh
 
 PLUGIN = "relit_rough_plastic"
@@ -120,47 +120,41 @@ def build_flash_scene(mesh: Mesh, material: Material, world_from_asset=None) -> 
     return FlashScene(scene, t, unit_from_world, mi.traverse(scene))
 
 
-def render_flash(scene: FlashScene, camera: Camera, flash: Flash, spp: int = 64, *, seed: int = 0, max_depth: int = 4) -> np.ndarray:
-    """(H, W, 4) float32 linear premultiplied radiance and coverage. max_depth: longest path in edges (2 = direct light only)."""
+def render_flash(
+    scene: FlashScene, camera: Camera, flash: Flash, spp: int = 64, *, seed: int = 0, max_depth: int = 4, where=None, progress=None
+) -> np.ndarray:
+    """(H, W, 4) float32 linear premultiplied radiance and coverage. max_depth: longest path in edges (2 = direct light only). where,
+    progress: see `mitsuba_scene.sample_sums`; 0 elsewhere."""
     if max_depth < 2 or spp < 1:
         raise ValueError("max_depth must be at least 2 and spp at least 1")
     s = scale_of(scene.unit_from_world)
     scene.parameters["light.position"] = mi.Point3f(move_points(scene.unit_from_world, flash_position(flash, camera)).tolist())
     scene.parameters.update()
-    pixels = camera.width * camera.height
     path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True})
-    total = np.zeros((pixels, 4))
-    with dr.suspend_grad():
-        for sampler, n in sample_passes(camera, spp, seed):
-            ray, _ = camera_rays(scene, camera, sampler, n * pixels)
-            colour, hit, _ = path.sample(scene.mi_scene, sampler, ray)
-            rgba = [*colour, dr.select(hit, mi.Float(1), 0)]
-            dr.eval(rgba)
-            for c in range(4):
-                total[:, c] += np.asarray(rgba[c].numpy(), np.float32).reshape(n, pixels).sum(0, dtype=np.float64)
-    out = total / spp
+
+    def sample(ray, _, sampler):
+        colour, hit, _ = path.sample(scene.mi_scene, sampler, ray)
+        return [*colour, dr.select(hit, mi.Float(1), 0)]
+
+    out = sample_sums(scene, camera, spp, seed, sample, where, progress) / spp
     out[:, :3] *= np.asarray(flash.intensity) * s * s
-    return np.where(np.isfinite(out), out, 0).reshape(camera.height, camera.width, 4).astype(np.float32)
+    return as_picture(out, camera, where)
 
 
 def render_maps(scene: FlashScene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, np.ndarray]:
     """Means over the covered part of each pixel, 0 where nothing is hit: diffuse (H, W, 3), specular, alpha (width of the lobe), coverage
     (H, W), normal (H, W, 3) unit, WORLD frame."""
-    pixels = camera.width * camera.height
-    total = np.zeros((pixels, 9))
     t = scene.textures
-    with dr.suspend_grad():
-        for sampler, n in sample_passes(camera, spp, seed):
-            ray, _ = camera_rays(scene, camera, sampler, n * pixels)
-            si = scene.mi_scene.ray_intersect(ray)
-            hit = si.is_valid()
-            normal = si.to_world(mi.Vector3f(shading_normal(si, t["normalmap"], hit)))
-            base = mi.Color3f(t["base_color"].eval(si, hit))
-            values = [*base, t["specular"].eval_1(si, hit), dr.square(t["roughness"].eval_1(si, hit)), *normal, mi.Float(1)]
-            values = [dr.select(hit, v, 0) for v in values]
-            dr.eval(values)
-            for c, v in enumerate(values):
-                total[:, c] += v.numpy().reshape(n, pixels).sum(0, dtype=np.float64)
+
+    def sample(ray, *_):
+        si = scene.mi_scene.ray_intersect(ray)
+        hit = si.is_valid()
+        normal = si.to_world(mi.Vector3f(shading_normal(si, t["normalmap"], hit)))
+        base = mi.Color3f(t["base_color"].eval(si, hit))
+        values = [*base, t["specular"].eval_1(si, hit), dr.square(t["roughness"].eval_1(si, hit)), *normal, mi.Float(1)]
+        return [dr.select(hit, v, 0) for v in values]
+
+    total = sample_sums(scene, camera, spp, seed, sample)
     mean = (total / np.maximum(total[:, 8:], 1e-9)).reshape(camera.height, camera.width, 9).astype(np.float32)
     length = np.linalg.norm(mean[..., 5:8], axis=-1, keepdims=True)
     coverage = (total[:, 8] / spp).reshape(camera.height, camera.width).astype(np.float32)

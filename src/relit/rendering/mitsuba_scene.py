@@ -6,6 +6,7 @@ serves every view of a scene.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -140,13 +141,11 @@ def build_geometry(mesh: Mesh):
     return mi.load_dict({"type": "scene", "object": mitsuba_mesh(mesh, mi.load_dict({"type": "diffuse"}), False)})
 
 
-def camera_rays(scene: Scene, camera: Camera, sampler, count: int):
-    """`count` rays (sample-major: pixel = index mod W * H) through uniformly jittered positions (a box filter), in the unit frame;
-    also the cosine to the optical axis, which turns distance into depth."""
+def camera_rays(scene: Scene, camera: Camera, index, sampler):
+    """A ray through each pixel of `index` (UInt32, row by row), uniformly jittered (a box filter), in the unit frame; also the cosine to
+    the optical axis, which turns distance into depth."""
     if camera.distortion and np.any(np.asarray(camera.distortion)):
         raise UserError("a camera with lens distortion cannot be rendered", "pictures are pinhole pictures", "undistort the camera first")
-    pixels = camera.width * camera.height
-    index = dr.arange(mi.UInt32, count) % pixels
     jitter = sampler.next_2d()
     o = lambda x: dr.opaque(mi.Float, float(x))  # noqa: E731  values that change per view must not become literals
     x = (mi.Float(index % camera.width) + jitter.x - o(camera.cx)) / o(camera.fx)
@@ -157,41 +156,57 @@ def camera_rays(scene: Scene, camera: Camera, sampler, count: int):
     return mi.RayDifferential3f(mi.Point3f(m[0][3], m[1][3], m[2][3]), dr.normalize(d)), inv
 
 
-def sample_passes(camera: Camera, spp: int, seed: int):
-    """(sampler, samples per pixel) of each pass of a rendering, with the memory of one pass bounded."""
-    pixels = camera.width * camera.height
-    per_pass = max(1, min(spp, RAYS_PER_PASS // pixels))
-    done = k = 0
-    while done < spp:
-        n = min(per_pass, spp - done)
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(dr.opaque(mi.UInt32, (seed * 9973 + k) & 0xFFFFFFFF), n * pixels)
-        yield sampler, n
-        done, k = done + n, k + 1
+def sample_sums(scene, camera: Camera, spp: int, seed: int, sample: Callable, where=None, progress: Callable | None = None) -> np.ndarray:
+    """(N, C) float64: sums over the samples of each pixel, row by row; of the pixels of `where`, (H, W) bool, alone where that is given.
+
+    sample(ray, cosine, sampler): C Floats for rays of `camera_rays`. progress: called with (samples of a pixel that are done, spp). The
+    memory of one pass is bounded.
+    """
+    chosen = None if where is None else np.flatnonzero(where).astype(np.uint32)
+    pixels = camera.width * camera.height if chosen is None else len(chosen)
+    per_pass = max(1, min(spp, RAYS_PER_PASS // max(pixels, 1)))
+    total, done, k = 0.0, 0, 0
+    with dr.suspend_grad():
+        while done < spp:
+            n = min(per_pass, spp - done)
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(dr.opaque(mi.UInt32, (seed * 9973 + k) & 0xFFFFFFFF), n * pixels)
+            # an array in memory, not a remainder: how many pixels there are is no literal of the kernel
+            index = dr.arange(mi.UInt32, n * pixels) % pixels if chosen is None else mi.UInt32(np.tile(chosen, n))
+            values = sample(*camera_rays(scene, camera, index, sampler), sampler)
+            dr.eval(values)
+            total = total + np.stack([v.numpy().reshape(n, pixels).sum(0, dtype=np.float64) for v in values], -1)
+            done, k = done + n, k + 1
+            if progress is not None:
+                progress(done, spp)
+    return total
 
 
-def render(scene: Scene, camera: Camera, *, spp: int, seed: int = 0, max_depth: int = 6) -> np.ndarray:
+def render(scene: Scene, camera: Camera, *, spp: int, seed: int = 0, max_depth: int = 6, where=None, progress=None) -> np.ndarray:
     """(H, W, 4) float32: linear radiance premultiplied on black, and alpha. Box filter; the environment lights but is not seen.
 
-    max_depth: longest path in edges (2 = direct light only, 6 = four inter-reflections). Not differentiable.
+    max_depth: longest path in edges (2 = direct light only, 6 = four inter-reflections). where, progress: see `sample_sums`; 0 elsewhere.
+    Not differentiable.
     """
-    pixels, depth = camera.width * camera.height, dr.opaque(mi.UInt32, max_depth)
+    depth = dr.opaque(mi.UInt32, max_depth)
     if scene.origins is None:
         path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000, "hide_emitters": True})
-    total = np.zeros((pixels, 4))
-    with dr.suspend_grad():
-        for sampler, n in sample_passes(camera, spp, seed):
-            ray, _ = camera_rays(scene, camera, sampler, n * pixels)
-            if scene.origins is None:
-                color, hit, _ = path.sample(scene.mi_scene, sampler, ray)
-            else:
-                color, hit = trace(scene.mi_scene, scene.mi_scene.shapes()[0].bsdf(), scene.origins, sampler, mi.Ray3f(ray), depth)
-            rgba = [*color, dr.select(hit, mi.Float(1), 0)]
-            dr.eval(rgba)
-            for c in range(4):
-                total[:, c] += np.asarray(rgba[c].numpy(), np.float32).reshape(n, pixels).sum(0, dtype=np.float64)
-    out = total / spp
-    return np.where(np.isfinite(out), out, 0).reshape(camera.height, camera.width, 4).astype(np.float32)
+
+    def sample(ray, _, sampler):
+        if scene.origins is None:
+            color, hit, _ = path.sample(scene.mi_scene, sampler, ray)
+        else:
+            color, hit = trace(scene.mi_scene, scene.mi_scene.shapes()[0].bsdf(), scene.origins, sampler, mi.Ray3f(ray), depth)
+        return [*color, dr.select(hit, mi.Float(1), 0)]
+
+    return as_picture(sample_sums(scene, camera, spp, seed, sample, where, progress) / spp, camera, where)
+
+
+def as_picture(values: np.ndarray, camera: Camera, where=None) -> np.ndarray:
+    """(H, W, C) float32 of the values (N, C) of pixels, see `sample_sums`; what is no number becomes 0."""
+    out = np.zeros((camera.height, camera.width, values.shape[-1]), np.float32)
+    out[np.ones(out.shape[:2], bool) if where is None else where] = np.where(np.isfinite(values), values, 0)
+    return out
 
 
 def render_channels(scene: Scene, camera: Camera, spp: int = 16, seed: int = 0) -> dict[str, np.ndarray]:
@@ -200,21 +215,17 @@ def render_channels(scene: Scene, camera: Camera, spp: int = 16, seed: int = 0) 
     albedo: (H, W, 3) linear base colour. roughness, metallic: (H, W). normal: (H, W, 3) unit shading normals in the WORLD frame.
     depth: (H, W) along the optical axis in world units. alpha: (H, W) coverage.
     """
-    pixels = camera.width * camera.height
-    total = np.zeros((pixels, 10))
     t = scene.textures
-    with dr.suspend_grad():
-        for sampler, n in sample_passes(camera, spp, seed):
-            ray, cos = camera_rays(scene, camera, sampler, n * pixels)
-            si = scene.mi_scene.ray_intersect(ray)
-            hit = si.is_valid()
-            normal = si.to_world(mi.Vector3f(relit_bsdf.shading_normal(si, t["normalmap"], hit)))
-            base = mi.Color3f(t["base_color"].eval(si, hit))
-            values = [*base, t["roughness"].eval_1(si, hit), t["metallic"].eval_1(si, hit), *normal, si.t * cos, mi.Float(1)]
-            values = [dr.select(hit, v, 0) for v in values]
-            dr.eval(values)
-            for c, v in enumerate(values):
-                total[:, c] += v.numpy().reshape(n, pixels).sum(0, dtype=np.float64)
+
+    def sample(ray, cosine, _):
+        si = scene.mi_scene.ray_intersect(ray)
+        hit = si.is_valid()
+        normal = si.to_world(mi.Vector3f(relit_bsdf.shading_normal(si, t["normalmap"], hit)))
+        base = mi.Color3f(t["base_color"].eval(si, hit))
+        values = [*base, t["roughness"].eval_1(si, hit), t["metallic"].eval_1(si, hit), *normal, si.t * cosine, mi.Float(1)]
+        return [dr.select(hit, v, 0) for v in values]
+
+    total = sample_sums(scene, camera, spp, seed, sample)
     count = np.maximum(total[:, 9:], 1e-9)
     mean = (total / count).reshape(camera.height, camera.width, 10).astype(np.float32)
     normal = mean[..., 5:8]

@@ -17,30 +17,31 @@ Shower = Callable[..., np.ndarray]
 
 
 def as_photographed(asset: Asset) -> Shower:
-    """show(name, camera, spp=, seed=0) -> (H, W, 4) float32: linear radiance premultiplied on black, and alpha.
+    """show(name, camera, spp=, seed=0, where=None, progress=None) -> (H, W, 4) float32: linear radiance premultiplied on black, and alpha.
 
     name: of one of the asset's photos, camera: any (the photo's own, resized). Of a flash capture: the rough plastic under the flash where
     it is when `camera` takes its photo. Of duplicates: all registered instances on their ground. Of a collection: under the light of the
-    photo `name`, its exposure in it; under the environment for other names. Else: the object under the environment.
+    photo `name`, its exposure in it; under the environment for other names. Else: the object under the environment. where, progress: see
+    `mitsuba_scene.sample_sums`.
     """
     if asset.flash is not None:
         flash_scene = build_flash_scene(asset.mesh, asset.material, asset.world_from_asset)
 
-        def show(name: str, camera: Camera, *, spp: int, seed: int = 0) -> np.ndarray:
-            return render_flash(flash_scene, camera, asset.flash, spp, seed=seed, max_depth=FLASH_DEPTH)
+        def show(name: str, camera: Camera, *, spp: int, seed: int = 0, **how) -> np.ndarray:
+            return render_flash(flash_scene, camera, asset.flash, spp, seed=seed, max_depth=FLASH_DEPTH, **how)
 
     elif asset.lights:
         lights = {name: light for (name, _), light in zip(asset.cameras, asset.lights, strict=True)}
 
-        def show(name: str, camera: Camera, *, spp: int, seed: int = 0) -> np.ndarray:
+        def show(name: str, camera: Camera, *, spp: int, seed: int = 0, **how) -> np.ndarray:
             light = lights.get(name, asset.environment)
-            return render(build_scene(asset.mesh, asset.material, asset.world_from_asset, light), camera, spp=spp, seed=seed)
+            return render(build_scene(asset.mesh, asset.material, asset.world_from_asset, light), camera, spp=spp, seed=seed, **how)
 
     else:
         scene = lit_scene(asset)
 
-        def show(name: str, camera: Camera, *, spp: int, seed: int = 0) -> np.ndarray:
-            return render(scene, camera, spp=spp, seed=seed)
+        def show(name: str, camera: Camera, *, spp: int, seed: int = 0, **how) -> np.ndarray:
+            return render(scene, camera, spp=spp, seed=seed, **how)
 
     return show
 

@@ -98,7 +98,7 @@ def instance_ids(scene: Scene, pile: Pile, camera: Camera, samples: int = 9) -> 
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(dr.opaque(mi.UInt32, 1000 + k), pixels)
         with dr.suspend_grad():
-            ray, _ = camera_rays(scene, camera, sampler, pixels)
+            ray, _ = camera_rays(scene, camera, dr.arange(mi.UInt32, pixels), sampler)
             pi = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
             which = dr.select(pi.is_valid(), pi.prim_index // pile.faces_each, pile.count)
         votes[index, np.minimum(which.numpy().astype(np.int64), pile.count)] += 1

@@ -62,21 +62,15 @@ def relight_flags(parser: Parser) -> None:
 def do_relight(args) -> None:
     free(args.out, args.overwrite)
     from relit.device import use_device
-    from relit.log import Log, Progress
+    from relit.log import counted
 
     use_device(args.device)
     from relit.relight import relight
 
-    progress = Progress(Log(), "relight", None)
-
-    def show(done: int, count: int) -> None:
-        progress.steps = count
-        progress.update(done)
-
     options = {"cameras": args.cameras, "spp": args.spp, "size": args.size, "exr": args.exr, "rotate": args.rotate}
     options["albedo_scale"] = args.albedo_scale
-    relight(args.run, args.light, args.out, progress=show, **options)
-    progress.log.clear()
+    with counted("relight") as progress:
+        relight(args.run, args.light, args.out, progress=progress, **options)
     print(args.out)
 
 

@@ -56,12 +56,15 @@ def do_edit(args) -> None:
         raise UserError("--base-color has a value above 1", "a surface reflects no more than it receives", code=EXIT_USAGE)
     free(args.out, args.overwrite)
     from relit.device import use_device
+    from relit.log import counted
 
     use_device(args.device)
     from relit.edit import edit
 
     names = ("photo", "tint", "base_color", "roughness", "metallic", "remove", "spp")
-    for path in edit(args.run, args.out, **{name: getattr(args, name) for name in names}):
+    with counted("edit, thousands of pixels") as progress:
+        written = edit(args.run, args.out, **{name: getattr(args, name) for name in names}, progress=progress)
+    for path in written:
         print(path)
 
 
@@ -82,8 +85,12 @@ def insert_flags(parser: Parser) -> None:
 def do_insert(args) -> None:
     free(args.out, args.overwrite)
     from relit.device import use_device
+    from relit.log import counted
 
     use_device(args.device)
     from relit.edit import insert
 
-    print(insert(args.run, args.model, args.out, photo=args.photo, at=args.at, size=args.size, turn=args.turn, spp=args.spp))
+    names = ("photo", "at", "size", "turn", "spp")
+    with counted("insert, thousands of pixels") as progress:
+        written = insert(args.run, args.model, args.out, **{name: getattr(args, name) for name in names}, progress=progress)
+    print(written)
