@@ -1,8 +1,9 @@
 """What a change does to a photo: differential rendering (Debevec 1998, Sec. 4), as finely as the change shows.
 
 Where the changed thing itself is seen, the picture is rendered. Everywhere else the photo stays, plus what the change does to it, render
-after minus render before: contact shadows and inter-reflections fall on what was photographed. Most of a photo is too far away for that to
-be seen, and what little there is is smooth. So both are rendered at a quarter of the size first, and at full size only where they differ.
+after minus render before: contact shadows and inter-reflections fall on what was photographed. On most of a photo that is nothing, or
+changes slowly from place to place. So both are rendered at a quarter of the size first, and at full size only where their difference has
+detail.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from relit.scene import Camera
 
 COARSE = 4  # times smaller
 LEAST = 256  # pixels, the longer side of photos that are rendered as they are
-SEEN = 0.01  # part of the photo's own radiance, from which on a difference is rendered at full size
+DETAIL = 0.03  # part of the photo's own radiance, from which on detail is rendered at full size
 DARK = 0.02  # radiance, added to the photo's: in the dark more is needed to be seen
-SMOOTH = 1.0  # coarse pixels, standard deviation: noise of the difference
-REACH = 2  # coarse pixels around what differs
+SMOOTH, SMOOTHER = 1.0, 3.0  # coarse pixels, standard deviations: against noise of the difference, and what is no detail
+REACH = 1  # coarse pixels around detail
 
 Show = Callable[..., np.ndarray]  # show(camera, where=None, progress=None) -> (H, W, 3), see `mitsuba_scene.render`
 
@@ -31,7 +32,7 @@ def change_of(
     photo brighter, in all pixels but those of `own`.
 
     picture: (H, W, 3) linear radiance of the photo. own: (H, W) bool, the changed thing itself. rim: (H, W) bool, pixels that it shares.
-    progress: called with (done, all) in thousands of pixels; all is a guess until it is known where the change is seen.
+    progress: called with (done, all) in thousands of pixels; all is a guess until it is known where there is detail.
     """
     h, w = own.shape
     rim = np.zeros_like(own) if rim is None else rim & ~own
@@ -43,11 +44,11 @@ def change_of(
         size = (small.width, small.height)
         told.all = 2 * small.width * small.height + 3 * int(own.sum())
         coarse = after(small, progress=told.of(small.width * small.height)) - before(small, progress=told.of(small.width * small.height))
-        coarse = cv2.GaussianBlur(coarse, (0, 0), SMOOTH)
-        seen = (np.abs(coarse) > SEEN * (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) + DARK)).any(-1)
+        detail = np.abs(cv2.GaussianBlur(coarse, (0, 0), SMOOTH) - cv2.GaussianBlur(coarse, (0, 0), SMOOTHER))
+        seen = (detail > DETAIL * (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) + DARK)).any(-1)
         seen = cv2.dilate(seen.astype(np.uint8), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8))
         near = (cv2.resize(seen, (w, h), interpolation=cv2.INTER_NEAREST) > 0) & ~own | rim
-        change = cv2.resize(coarse, (w, h), interpolation=cv2.INTER_LINEAR)
+        change = cv2.resize(cv2.GaussianBlur(coarse, (0, 0), SMOOTH), (w, h), interpolation=cv2.INTER_LINEAR)
     shown = np.zeros_like(picture)
     told.all = told.done + 2 * int(near.sum()) + int(own.sum())
     for part, both in ((near, True), (own, False)):  # noise cancels where both draw the same numbers, so for the same pixels
