@@ -145,7 +145,7 @@ def test_video(run, from_above, tmp_path, monkeypatch, with_ffmpeg):
     seen = []
     out = tmp_path / "turn.mp4"
     assert relight(run, from_above, out, cameras="orbit:3", size=32, spp=2, progress=lambda *a: seen.append(a)) == [out]
-    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert seen == [(2, 6), (4, 6), (6, 6)]  # of three pictures with two samples each
     video = cv2.VideoCapture(str(out))
     frames = []
     while (got := video.read())[0]:

@@ -49,7 +49,8 @@ def relight(
     cameras: 'capture' (the asset's own), 'orbit:N' (a turntable of N pictures), or a transforms.json in the world frame.
     out: a folder (PNG on black, sRGB, clipped at 1; also linear RGBA .exr with exr=True) or FILE.mp4 (24 pictures a second).
     Of duplicates cameras of the world show all instances on their ground, a turntable the object alone.
-    size: longer side in pixels. albedo_scale: number or 3 that multiply the base colour. progress: called with (done, all).
+    size: longer side in pixels. albedo_scale: number or 3 that multiply the base colour. progress: called with (done, all), in
+    samples a pixel of all pictures.
     """
     out, light = Path(out), Path(light)
     if spp < 1 or (size is not None and not 8 <= size <= 16384):
@@ -66,9 +67,8 @@ def relight(
         for i, (name, camera) in enumerate(views):
             if video and (camera.width, camera.height) != (views[0][1].width, views[0][1].height):
                 raise UserError("the cameras have different sizes, a video has one", fix="write pictures to a folder, or use orbit:N")
-            files += add(name, render(scene, camera, spp=spp, seed=seed + i, max_depth=max_depth), exr)
-            if progress is not None:
-                progress(i + 1, len(views))
+            told = None if progress is None else lambda samples, of, i=i: progress(i * of + samples, len(views) * of)
+            files += add(name, render(scene, camera, spp=spp, seed=seed + i, max_depth=max_depth, progress=told), exr)
     return [out] if video else files
 
 

@@ -69,7 +69,7 @@ def do_relight(args) -> None:
 
     options = {"cameras": args.cameras, "spp": args.spp, "size": args.size, "exr": args.exr, "rotate": args.rotate}
     options["albedo_scale"] = args.albedo_scale
-    with counted("relight") as progress:
+    with counted("relight, samples a pixel") as progress:
         relight(args.run, args.light, args.out, progress=progress, **options)
     print(args.out)
 
