@@ -101,29 +101,32 @@ def which_objects(source: Path, photo: Path) -> str | None:
     if source.suffix.lower() != ".json":
         return None
     data = read_json(source)
-    kinds = _coco_kinds(data, photo)
-    if len(set(kinds)) < 2:
+    if (chosen := _coco_category(data, photo)) is None:
         return None
-    chosen = _commonest(kinds)
     listed = data.get("categories")
     names = {c.get("id"): c.get("name") for c in listed if isinstance(c, dict)} if isinstance(listed, list) else {}
-    return f"the objects are those of category {names.get(chosen, chosen)}, the commonest of {len(set(kinds))}; others are left out"
+    return f"the objects are those of category {names.get(chosen, chosen)}, the commonest; others are left out"
 
 
 def _commonest(kinds: list):
     return max(sorted(set(kinds)), key=kinds.count)
 
 
-def _coco_kinds(data: dict, photo: Path) -> list[int]:
-    """Category of each annotated object of the photos that lie in the photo's folder, -1 where none is told; groups of objects (iscrowd) do
-    not count."""
+def _coco_category(data: dict, photo: Path) -> int | None:
+    """Of several categories the one with the most objects in the photos that lie in the photo's folder; None where all objects count: there
+    is but one, or each object has one of its own. What says that it is a group (iscrowd) is an object too: many tools write it of whatever
+    has run lengths."""
     images = [i for i in data["images"] if isinstance(i, dict)]
     here = {f.name for f in photo.parent.iterdir()}
     ids = [i.get("id") for i in images if Path(str(i.get("file_name", ""))).name in here] or [i.get("id") for i in images]
-    return [_coco_kind(a) for a in data["annotations"] if isinstance(a, dict) and a.get("image_id") in ids and not a.get("iscrowd")]
+    kinds = [_coco_kind(a) for a in data["annotations"] if isinstance(a, dict) and a.get("image_id") in ids]
+    if len(set(kinds)) < 2 or len(set(kinds)) == len(kinds):
+        return None
+    return _commonest(kinds)
 
 
 def _coco_kind(annotation: dict) -> int:
+    """-1 where none is told."""
     kind = annotation.get("category_id")
     return kind if isinstance(kind, int) else -1
 
@@ -142,9 +145,9 @@ def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
         raise UserError(f"the annotations give the photo {photo.name} the size {size}", fix=f"check `images`: {file}")
     sx, sy = shape[1] / size[1], shape[0] / size[0]
     labels, k = np.zeros(shape, np.int32), 0
-    chosen = _commonest(_coco_kinds(data, photo) or [-1])
+    chosen = _coco_category(data, photo)
     for a in data["annotations"]:
-        if not isinstance(a, dict) or a.get("image_id") != entry.get("id") or a.get("iscrowd") or _coco_kind(a) != chosen:
+        if not isinstance(a, dict) or a.get("image_id") != entry.get("id") or chosen not in (None, _coco_kind(a)):
             continue
         k += 1
         s = a.get("segmentation")
