@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -79,3 +80,15 @@ def test_pixels_that_the_new_thing_shares_are_rendered_both_ways(piles):
     edge[-20:, :20] = True  # far from it: no change
     got, change = change_of(partial(shown, before), partial(shown, after), camera, picture, ids == 1, edge)
     assert got[edge].mean() == pytest.approx(picture[edge].mean(), rel=0.02) and np.abs(change[edge]).mean() < 0.01
+
+
+def test_nothing_of_the_object_itself_leaks_onto_what_it_stands_before():
+    mesh, material = pawn(rows=24, columns=24, texture=32)
+    light, camera = np.full((8, 16, 3), 0.5, np.float32), Camera(320, 240, 330.0, 330.0, 160.0, 120.0, look_at([0, 1.5, 4.0], (0, 0.5, 0)))
+    red = replace(material, base_color=np.broadcast_to(np.float32([0.9, 0, 0]), material.base_color.shape).copy())
+    before, after = (build_scene(mesh, m, None, light) for m in (material, red))
+    alpha = render(before, camera, spp=64)[..., 3]
+    own, picture = alpha > 0.5, np.full((240, 320, 3), 2.0, np.float32)
+    _, change = change_of(partial(shown, before), partial(shown, after), camera, picture, own)
+    beside = (cv2.dilate(own.astype(np.uint8), np.ones((25, 25))) > 0) & (cv2.dilate(alpha, np.ones((5, 5))) == 0)
+    assert beside.sum() > 1000 and np.abs(change[beside]).max() < 1e-3

@@ -20,7 +20,7 @@ LEAST = 256  # pixels, the longer side of photos that are rendered as they are
 DETAIL = 0.03  # part of the photo's own radiance, from which on detail is rendered at full size
 DARK = 0.02  # radiance, added to the photo's: in the dark more is needed to be seen
 SMOOTH, SMOOTHER = 1.0, 3.0  # coarse pixels, standard deviations: against noise of the difference, and what is no detail
-REACH = 1  # coarse pixels around detail
+REACH = 1  # coarse pixels around detail, and around the changed thing, which pixels beside `own` still show in part
 
 Show = Callable[..., np.ndarray]  # show(camera, where=None, progress=None) -> (H, W, 3), see `mitsuba_scene.render`
 
@@ -44,11 +44,14 @@ def change_of(
         size = (small.width, small.height)
         told.all = 2 * small.width * small.height + 3 * int(own.sum())
         coarse = after(small, progress=told.of(small.width * small.height)) - before(small, progress=told.of(small.width * small.height))
-        detail = np.abs(cv2.GaussianBlur(coarse, (0, 0), SMOOTH) - cv2.GaussianBlur(coarse, (0, 0), SMOOTHER))
-        seen = (detail > DETAIL * (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) + DARK)).any(-1)
-        seen = cv2.dilate(seen.astype(np.uint8), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8))
+        around = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+        outside = cv2.dilate(cv2.resize(own.astype(np.float32), size, interpolation=cv2.INTER_AREA), around) == 0
+        smooth, smoother = (_smoothed(coarse, outside, width) for width in (SMOOTH, SMOOTHER))
+        bright = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) + DARK
+        seen = (np.abs(smooth - smoother) > DETAIL * bright).any(-1) | ~outside
+        seen = cv2.dilate(seen.astype(np.uint8), around)
         near = (cv2.resize(seen, (w, h), interpolation=cv2.INTER_NEAREST) > 0) & ~own | rim
-        change = cv2.resize(cv2.GaussianBlur(coarse, (0, 0), SMOOTH), (w, h), interpolation=cv2.INTER_LINEAR)
+        change = cv2.resize(smooth, (w, h), interpolation=cv2.INTER_LINEAR)
     shown = np.zeros_like(picture)
     told.all = told.done + 2 * int(near.sum()) + int(own.sum())
     for part, both in ((near, True), (own, False)):  # noise cancels where both draw the same numbers, so for the same pixels
@@ -57,6 +60,12 @@ def change_of(
             if both:
                 change[part] = shown[part] - before(camera, where=part, progress=told.of(int(part.sum())))[part]
     return shown, change
+
+
+def _smoothed(picture: np.ndarray, where: np.ndarray, width: float) -> np.ndarray:
+    """Gaussian means (H, W, 3) of what a picture shows in the pixels of `where`, (H, W) bool, alone."""
+    share = cv2.GaussianBlur(where.astype(np.float32), (0, 0), width)[..., None]
+    return cv2.GaussianBlur(picture * where[..., None], (0, 0), width) / np.maximum(share, 1e-3)
 
 
 class Told:
