@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cv2 import imwrite as cv_write
+from two_pawns import two_pawns
 
 from relit.asset.asset import load_asset, save_asset
 from relit.cameras.se3 import look_at
-from relit.capture.procedural import pawn
-from relit.conventions import similarity
 from relit.edit import as_shown, camera_of, edit, insert
 from relit.errors import UserError
 from relit.files import digests
@@ -20,18 +19,14 @@ from relit.relight import relight
 from relit.rendering.mitsuba_scene import build_scene, render
 from relit.rendering.photographed import as_photographed
 from relit.rendering.pile import build_pile, instance_ids
-from relit.scene import Asset, Camera, Flash, Ground, Instance
+from relit.scene import Asset, Camera, Flash, Instance
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """(asset folder, photo): two objects on the ground, lit from one side."""
     folder = tmp_path_factory.mktemp("edit")
-    mesh, material = pawn(rows=24, columns=24, texture=32)
-    poses = [similarity(np.eye(3), [-1.0, 0, 0]), similarity(np.eye(3), [1.0, 0, 0])]
-    ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 12.0, np.array([0.4, 0.4, 0.4]))
-    environment = np.full((8, 16, 3), 0.3, np.float32)
-    environment[1:3, 2:5] = 6.0
+    mesh, material, poses, ground, environment = two_pawns()
     camera = Camera(72, 54, 80.0, 80.0, 36.0, 27.0, look_at([0, 3.5, 5.0], (0, 0.4, 0)))
     instances = (Instance(10, poses[0]), Instance(20, poses[1]))
     asset = Asset(mesh, material, poses[0], environment, (("photo.png", camera),), {}, None, instances, ground)

@@ -23,8 +23,8 @@ from relit.files import digests
 from relit.images import read_image, write_srgb
 from relit.materials.plastic_as_gltf import base_colour, diffuse_albedo
 from relit.rendering.changed import change_of
-from relit.rendering.mitsuba_scene import Scene, build_scene, render
-from relit.rendering.photographed import Shower, as_photographed
+from relit.rendering.mitsuba_scene import build_scene, render
+from relit.rendering.photographed import as_photographed
 from relit.rendering.pile import build_pile, instance_ids, joined
 from relit.scene import Asset, Camera, Material, Mesh
 
@@ -84,7 +84,7 @@ def edit(
             told = as_shown(told, shown)
         gone = cleared(shown, told, remove)
         own = gone if same else gone | (new_ids >= 0)
-        shows = [partial(_as_photographed, as_photographed(a), name, spp, seed) for a in (asset, changed)]
+        shows = [partial(as_photographed(a), name, spp=spp, seed=seed) for a in (asset, changed)]
         after, change = change_of(*shows, camera, picture, own, progress=progress)
         write_srgb(out / "photo.png", np.clip(np.where(own[..., None], after, picture + change), 0, 1))
         written.append(out / "photo.png")
@@ -167,7 +167,7 @@ def insert(
     whole, materials = joined(pile.mesh, pile.material, placed, material)
     scene = build_scene(whole, materials, np.eye(4), asset.environment)
     cover = coverage(scene, len(pile.mesh.faces), camera)
-    shows = [partial(_rendered, s, spp, seed) for s in (before, scene)]
+    shows = [partial(render, s, spp=spp, seed=seed) for s in (before, scene)]
     after, change = change_of(*shows, camera, picture, cover == 1, cover > 0, progress)
     write_srgb(out, np.clip(cover[..., None] * after + (1 - cover[..., None]) * (picture + change), 0, 1))
     return out
@@ -214,14 +214,6 @@ def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.nd
             pi = scene.mi_scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
             total += (pi.is_valid() & (pi.prim_index >= first_face)).numpy()
     return (total / samples).reshape(camera.height, camera.width)
-
-
-def _rendered(scene: Scene, spp: int, seed: int, camera: Camera, **how) -> np.ndarray:
-    return render(scene, camera, spp=spp, seed=seed, **how)[..., :3]
-
-
-def _as_photographed(show: Shower, name: str, spp: int, seed: int, camera: Camera, **how) -> np.ndarray:
-    return show(name, camera, spp=spp, seed=seed, **how)[..., :3]
 
 
 def _ids(asset: Asset, camera: Camera) -> np.ndarray:

@@ -169,7 +169,7 @@ def test_coco_of_several_categories(tmp_path):
     annotations = [{"image_id": 7, "category_id": k, "segmentation": s, "iscrowd": crowd} for k, s, crowd in kinds]
     annotations += [{"image_id": 8, "category_id": 5, "segmentation": square(12)}] * 4  # of a photo that is not here
     images = [{"id": 7, "file_name": "photo.png", "width": W, "height": H}, {"id": 8, "file_name": "other.png"}]
-    data = {"images": images, "annotations": annotations, "categories": [{"id": 3, "name": "cup"}, {"id": 5, "name": "table"}]}
+    data = {"images": images, "annotations": annotations, "categories": [{"id": 3, "name": "cup"}, {"id": 5, "name": "table"}, {"id": [5]}]}
     (tmp_path / "annotations.json").write_text(json.dumps(data))
     capture = open_capture(path)
     labels = capture.photos[0].load().labels

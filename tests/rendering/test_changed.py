@@ -8,18 +8,18 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from two_pawns import two_pawns
 
 from relit.cameras.se3 import look_at
 from relit.capture.procedural import pawn
-from relit.conventions import similarity
 from relit.rendering.changed import change_of
 from relit.rendering.mitsuba_scene import build_scene, render
 from relit.rendering.pile import build_pile, instance_ids
-from relit.scene import Camera, Ground
+from relit.scene import Camera
 
 
-def shown(scene, camera, spp=32, **how):
-    return render(scene, camera, spp=spp, seed=3, **how)[..., :3]
+def shown(scene, camera, **how):
+    return render(scene, camera, spp=32, seed=3, **how)[..., :3]
 
 
 def blurred(picture):
@@ -30,11 +30,7 @@ def blurred(picture):
 @pytest.fixture(scope="module")
 def piles():
     """Scenes of two objects on the ground and of the left one alone, camera, and which object is where."""
-    mesh, material = pawn(rows=24, columns=24, texture=32)
-    poses = [similarity(np.eye(3), [-1.0, 0, 0]), similarity(np.eye(3), [1.0, 0, 0])]
-    ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 12.0, np.array([0.4, 0.4, 0.4]))
-    light = np.full((8, 16, 3), 0.3, np.float32)
-    light[1:3, 2:5] = 6.0
+    mesh, material, poses, ground, light = two_pawns()
     camera = Camera(400, 300, 330.0, 330.0, 200.0, 150.0, look_at([0, 4.5, 7.0], (0, 0.4, 0)))
     both, one = (build_pile(mesh, material, some, ground) for some in (poses, poses[:1]))
     scenes = [build_scene(p.mesh, p.material, np.eye(4), light) for p in (both, one)]

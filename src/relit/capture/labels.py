@@ -104,7 +104,8 @@ def which_objects(source: Path, photo: Path) -> str | None:
     if (chosen := _coco_category(data, photo)) is None:
         return None
     listed = data.get("categories")
-    names = {c.get("id"): c.get("name") for c in listed if isinstance(c, dict)} if isinstance(listed, list) else {}
+    listed = listed if isinstance(listed, list) else []
+    names = {c["id"]: c.get("name") for c in listed if isinstance(c, dict) and isinstance(c.get("id"), int)}
     return f"the objects are those of category {names.get(chosen, chosen)}, the commonest; others are left out"
 
 
@@ -117,9 +118,10 @@ def _coco_category(data: dict, photo: Path) -> int | None:
     is but one, or each object has one of its own. What says that it is a group (iscrowd) is an object too: many tools write it of whatever
     has run lengths."""
     images = [i for i in data["images"] if isinstance(i, dict)]
-    here = {f.name for f in photo.parent.iterdir()}
-    ids = [i.get("id") for i in images if Path(str(i.get("file_name", ""))).name in here] or [i.get("id") for i in images]
-    kinds = [_coco_kind(a) for a in data["annotations"] if isinstance(a, dict) and a.get("image_id") in ids]
+    names = {f.name for f in photo.parent.iterdir()}
+    here = [i for i in images if Path(str(i.get("file_name", ""))).name in names] or images
+    ids = {str(i.get("id")) for i in here}
+    kinds = [_coco_kind(a) for a in data["annotations"] if isinstance(a, dict) and str(a.get("image_id")) in ids]
     if len(set(kinds)) < 2 or len(set(kinds)) == len(kinds):
         return None
     return _commonest(kinds)

@@ -22,7 +22,7 @@ DARK = 0.02  # radiance, added to the photo's: in the dark more is needed to be 
 SMOOTH, SMOOTHER = 1.0, 3.0  # coarse pixels, standard deviations: against noise of the difference, and what is no detail
 REACH = 1  # coarse pixels around detail, and around the changed thing, which pixels beside `own` still show in part
 
-Show = Callable[..., np.ndarray]  # show(camera, where=None, progress=None) -> (H, W, 3), see `mitsuba_scene.render`
+Show = Callable[..., np.ndarray]  # show(camera, where=None, progress=None) -> (H, W, 4), see `mitsuba_scene.render`
 
 
 def change_of(
@@ -43,7 +43,7 @@ def change_of(
         small = camera.resized(max(1, w // COARSE), max(1, h // COARSE))
         size = (small.width, small.height)
         told.all = 2 * small.width * small.height + 3 * int(own.sum())
-        coarse = after(small, progress=told.of(small.width * small.height)) - before(small, progress=told.of(small.width * small.height))
+        coarse = (after(small, progress=told.of(size[0] * size[1])) - before(small, progress=told.of(size[0] * size[1])))[..., :3]
         around = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
         outside = cv2.dilate(cv2.resize(own.astype(np.float32), size, interpolation=cv2.INTER_AREA), around) == 0
         smooth, smoother = (_smoothed(coarse, outside, width) for width in (SMOOTH, SMOOTHER))
@@ -56,9 +56,9 @@ def change_of(
     told.all = told.done + 2 * int(near.sum()) + int(own.sum())
     for part, both in ((near, True), (own, False)):  # noise cancels where both draw the same numbers, so for the same pixels
         if part.any():
-            shown[part] = after(camera, where=part, progress=told.of(int(part.sum())))[part]
+            shown[part] = after(camera, where=part, progress=told.of(int(part.sum())))[part, :3]
             if both:
-                change[part] = shown[part] - before(camera, where=part, progress=told.of(int(part.sum())))[part]
+                change[part] = shown[part] - before(camera, where=part, progress=told.of(int(part.sum())))[part, :3]
     return shown, change
 
 
