@@ -49,7 +49,9 @@ def shown(mesh: Mesh, cameras: list[Camera], paint=colours):
     for k, camera in enumerate(cameras):
         seen = shown_by(mesh, scene, camera, np.ones((SIZE, SIZE), np.float32))
         brightness = 0.6 + 0.3 * np.sin(0.02 * x + k)[..., None]
-        pictures.append(np.where(seen.hit[..., None], brightness * paint(seen.point), 0.1).astype(np.float32))
+        picture = np.full((SIZE, SIZE, 3), 0.1, np.float32)
+        picture[seen.hit] = (np.broadcast_to(brightness, picture.shape)[seen.hit] * paint(seen.point)).astype(np.float32)
+        pictures.append(picture)
         hit = np.isfinite(trace(scene, camera, at[0].ravel(), at[1].ravel())[0])
         masks.append(hit.reshape(SIZE, SIZE, 16).mean(-1).astype(np.float32))
     return pictures, masks

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import bmat, coo_matrix, diags, identity
-from scipy.sparse.linalg import splu
 
 from relit.cameras.se3 import turns_apart
 from relit.fit.outlines import (
@@ -39,6 +38,7 @@ from relit.fit.outlines import (
     precision,
     spread_of,
 )
+from relit.fit.sparse import solved_symmetric
 from relit.fit.texture_shifts import Shifts, misfit, shares, texture_shifts
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
@@ -51,6 +51,7 @@ YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
 LABELS = 0.7  # pixels; what has contradicted textures is told no better than this
 FAINTEST = 0.15  # pixels; flow is told no better than this
 OUTLIER = 3.0  # spreads; a shift of so much counts a quarter
+TWO_WAYS = 2.0  # what a pair counts, that is looked at once: for each of its views
 SLANTED = 4.0  # size of M up to which a place is told
 DAMPED = 1e-4  # of the diagonal: the frame of all poses is free
 TURN = np.radians(3.0)  # of a pose, in one round
@@ -78,44 +79,58 @@ def follow_views(
     each view, see `outlines.follow_with_poses`. rounds: of outlines alone.
     """
     outlined, poses = follow_with_poses(mesh, cameras, masks, known, rounds)
-    before = misfit(texture_shifts(outlined, with_poses(cameras, poses), pictures, masks))
+    start = with_poses(cameras, poses)
+    shifts = texture_shifts(outlined, start, pictures, masks)
+    before = misfit(shifts)
     if before <= EXACT:
         return outlined, poses, None
-    placed = by_textures(outlined, with_poses(cameras, poses), pictures, masks)
-    if misfit(texture_shifts(outlined, placed, pictures, masks)) < min(SHARP, WHOLLY * before):
-        found, placed = by_both(outlined, placed, pictures, masks, known, BOTH)
+    placed, left = by_textures(outlined, start, shifts, pictures, masks)
+    if misfit(left) < min(SHARP, WHOLLY * before):
+        found, placed, left = by_both(outlined, placed, left, pictures, masks, known, BOTH)
     else:  # not the labels, then: the shape
-        found, placed = by_both(outlined, with_poses(cameras, poses), pictures, masks, known, SOFT, YIELDING)
-    after = misfit(texture_shifts(found, placed, pictures, masks))
+        found, placed, left = by_both(outlined, start, shifts, pictures, masks, known, SOFT, YIELDING)
+    after = misfit(left)
     if not 0 < after < before:
         return outlined, poses, None
     return found, np.array([c.world_from_camera for c in placed]), (before, after)
 
 
-def by_textures(mesh: Mesh, placed: list[Camera], pictures, masks) -> list[Camera]:
-    """The cameras after at most TEXTURES rounds in which textures alone move them."""
+def by_textures(mesh: Mesh, placed: list[Camera], shifts: list[Shifts], pictures, masks) -> tuple[list[Camera], list[Shifts]]:
+    """(cameras, shifts) after at most TEXTURES rounds in which textures alone move the cameras. shifts: as all stands."""
     for _ in range(TEXTURES):
-        shifts, before = texture_shifts(mesh, placed, pictures, masks), placed
-        placed = solved(mesh, placed, texture_rows(shifts, placed), still=True)[1] if shifts else placed
-        if settled(before, placed):
-            break
-    return placed
-
-
-def by_both(mesh: Mesh, placed: list[Camera], pictures, masks, known, rounds: int, softer: tuple[float, float] | None = None):
-    """(mesh, cameras) after at most so many rounds in which outlines and textures move both. softer: in the place of STIFF and REST;
-    outlines then count however far they are off."""
-    spread = 0.0
-    for _ in range(rounds):
-        shifts, before = texture_shifts(mesh, placed, pictures, masks), placed
         if not shifts:
             break
-        rows = texture_rows(shifts, placed)
-        outlines, spread = outline_rows(mesh, placed, masks, known, max(spread, LABELS) if softer else 0.0)
-        mesh, placed = solved(mesh, placed, rows + outlines, stiffness=softer or (STIFF, REST))
+        before = placed
+        placed = solved(mesh, placed, texture_rows(shifts, placed), still=True)[1]
+        shifts = texture_shifts(mesh, placed, pictures, masks)
         if settled(before, placed):
             break
-    return mesh, placed
+    return placed, shifts
+
+
+def by_both(
+    mesh: Mesh,
+    placed: list[Camera],
+    shifts: list[Shifts],
+    pictures,
+    masks,
+    known,
+    rounds: int,
+    softer: tuple[float, float] | None = None,
+) -> tuple[Mesh, list[Camera], list[Shifts]]:
+    """(mesh, cameras, shifts) after at most so many rounds in which outlines and textures move both. shifts: as all stands. softer: in the
+    place of STIFF and REST; outlines then count however far they are off."""
+    spread = 0.0
+    for _ in range(rounds):
+        if not shifts:
+            break
+        before, rows = placed, texture_rows(shifts, placed)
+        outlines, spread = outline_rows(mesh, placed, masks, known, max(spread, LABELS) if softer else 0.0)
+        mesh, placed = solved(mesh, placed, rows + outlines, stiffness=softer or (STIFF, REST))
+        shifts = texture_shifts(mesh, placed, pictures, masks)
+        if settled(before, placed):
+            break
+    return mesh, placed, shifts
 
 
 def settled(before: list[Camera], after: list[Camera]) -> bool:
@@ -158,7 +173,7 @@ def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
         m = (here @ t) @ np.linalg.pinv(there @ t)
         along = ((here - m @ there) @ s.normal[..., None])[..., 0]
         far = np.linalg.norm(s.shift, axis=1) / (OUTLIER * spread)
-        trust = (np.linalg.norm(m, axis=(1, 2)) < SLANTED) * share / (spread * (1 + far**2)) ** 2
+        trust = TWO_WAYS * (np.linalg.norm(m, axis=(1, 2)) < SLANTED) * share / (spread * (1 + far**2)) ** 2
         views = np.full(len(far), s.view), np.full(len(far), s.other)
         for axis in (0, 1):
             poses = [(views[0], turn_here[:, axis]), (views[1], -(m @ turn_there)[:, axis])]
@@ -209,7 +224,7 @@ def solved(
         smooth = pixels * laplacian(mesh.faces, vertices)
         stiff, rest = stiffness
         damping = bmat([[damping, None], [None, stiff * (smooth.T @ smooth) + rest * pixels**2 * identity(vertices)]])
-    step = splu((normal + damping).tocsc()).solve(a.T @ (trust * shift))
+    step = solved_symmetric(normal + damping, a.T @ (trust * shift))
     placed = [turned(c, s) for c, s in zip(cameras, step[: 6 * n].reshape(n, 6), strict=True)]
     return (mesh if still else moved(mesh, np.clip(step[6 * n :], -FARTHEST / pixels, FARTHEST / pixels))), placed
 

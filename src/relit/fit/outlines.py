@@ -201,6 +201,8 @@ def box_of(mesh: Mesh, camera: Camera, mask: np.ndarray) -> tuple[int, int, int,
 
 def trace(scene, camera: Camera, x: np.ndarray, y: np.ndarray):
     """Distance (infinite where nothing is met), face and its barycentrics (N, 2) along the rays through pixel positions."""
+    if len(x) == 0:
+        return np.zeros(0, np.float32), np.zeros(0, np.uint32), np.zeros((0, 2), np.float32)
     o, d = rays_through(mi.Float(camera_rows([camera])), mi.UInt32(0), mi.Float(x), mi.Float(y))
     met = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(o), d), coherent=True)
     hit = met.is_valid()

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.ndimage import map_coordinates
 
 from relit.conventions import srgb_from_linear
 from relit.fit.outlines import trace
-from relit.fit.unseen import seen_points
+from relit.fit.unseen import clear, facing, sight_rays
 from relit.rendering.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
@@ -35,7 +36,7 @@ BORDER = 0.1, 9  # of the root of the area that both views show, and pixels at m
 DIM = 0.15  # of the tint; what is darker has hardly a colour
 BACK = 0.7  # pixels by which there and back may miss
 FARTHEST = 12.0  # pixels
-SAMPLES = 250  # of a pair at most
+SAMPLES = 500  # of a pair at most
 LEAST = 20  # of a pair, or it is left out
 OVERLAP = 400  # pixels that a pair must share
 
@@ -58,17 +59,26 @@ class Shifts:
 
 @dataclass(frozen=True)
 class Shown:
-    """What a view shows of the mesh, (h, w) and (h, w, 3): is it hit inside the mask, vertices of the face, their shares, place, normal."""
+    """What a view shows of the mesh. hit: (h, w) bool, where it is hit inside the mask. point, normal: (N, 3) there, row by row."""
 
     hit: np.ndarray
-    corners: np.ndarray
-    weights: np.ndarray
     point: np.ndarray
     normal: np.ndarray
 
 
+@dataclass(frozen=True)
+class Faced:
+    """Which pixels of what a view shows another camera may see. pixels: (M,) among those that are hit. x, y: (N,) where it sees each of
+    those. rays: see `unseen.sight_rays`, of `pixels`."""
+
+    pixels: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    rays: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 def texture_shifts(mesh: Mesh, cameras: list[Camera], pictures: list[np.ndarray], masks: list[np.ndarray]) -> list[Shifts]:
-    """Of all pairs of views that look from similar sides, in both orders. cameras: in the frame of the mesh. pictures: (h, w, 3) linear.
+    """Of all pairs of views that look from similar sides. cameras: in the frame of the mesh. pictures: (h, w, 3) linear.
     masks: (h, w). Pairs that share too little, or hardly any structure, are left out."""
     scene = build_geometry(mesh)
     shown = [shown_by(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
@@ -81,10 +91,27 @@ def texture_shifts(mesh: Mesh, cameras: list[Camera], pictures: list[np.ndarray]
 def shifts_between(mesh: Mesh, scene, pairs: list[tuple[int, int, Shown, np.ndarray]], cameras: list[Camera], channels) -> list[Shifts]:
     """Of each pair of views i, j: what i shows, and the mask (h, w) of j. channels: (h, w, C) of each view; each that has structure
     counts for itself."""
-    met = [met_by(scene, shown, cameras[j], mask) for _, j, shown, mask in pairs]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # OpenCV and numpy let go of the interpreter
-        found = list(pool.map(lambda pair, there: flows_of(pair[2], channels[pair[0]], channels[pair[1]], *there), pairs, met))
-    return [shifts_of(mesh, scene, i, j, cameras[i], *flow) for (i, j, *_), flows in zip(pairs, found, strict=True) for flow in flows]
+    with threads_of_pairs() as pool:
+        faced = pool.map(lambda pair: faced_by(pair[2], cameras[pair[1]], pair[3]), pairs)
+        found = [
+            pool.submit(flows_of, shown, channels[i], channels[j], *met_of(scene, shown, one))
+            for (i, j, shown, _), one in zip(pairs, faced, strict=True)
+        ]
+        flows = [one.result() for one in found]
+    return [shifts_of(mesh, scene, i, j, cameras[i], *flow) for (i, j, *_), some in zip(pairs, flows, strict=True) for flow in some]
+
+
+@contextmanager
+def threads_of_pairs():
+    """A pool in which each pair is looked at by one thread: OpenCV and numpy let go of the interpreter, and OpenCV's own threads, by whose
+    number its flow differs, rest meanwhile."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            yield pool
+    finally:
+        cv2.setNumThreads(before)
 
 
 def misfit(shifts: list[Shifts]) -> float:
@@ -111,27 +138,33 @@ def clear_of(shifts: list[Shifts]) -> float:
 
 
 def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
-    """Ordered pairs of views from sides that are near one another. The object is about the origin."""
+    """Pairs of views from sides that are near one another, each once: what one shows against the other is what the other shows against it.
+    The object is about the origin."""
     sides = np.array([c.centre / np.linalg.norm(c.centre) for c in cameras])
     cosines = sides @ sides.T
     nearest = np.argsort(-cosines - 2 * np.eye(len(cameras)), axis=1)[:, :NEIGHBOURS]
-    return [(i, j) for i, j in permutations(range(len(cameras)), 2) if cosines[i, j] > np.cos(np.radians(ACROSS)) and j in nearest[i]]
+    near = cosines > np.cos(np.radians(ACROSS))
+    pairs = [(i, j) for i, j in combinations(range(len(cameras)), 2) if near[i, j] and (j in nearest[i] or i in nearest[j])]
+    return [(i, j) if (i + j) % 2 else (j, i) for i, j in pairs]  # as often as not into the one that comes first
 
 
 def shown_by(mesh: Mesh, scene, camera: Camera, mask: np.ndarray) -> Shown:
     """Of all pixels of a view."""
-    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]]
-    hit, *places = places_of(mesh, scene, camera, x.ravel() + 0.5, y.ravel() + 0.5)
-    return Shown(hit.reshape(mask.shape) & (mask > 0.5), *(a.reshape(*mask.shape, 3) for a in places))
+    row, column = np.nonzero(mask > 0.5)
+    there, _, _, point, normal = places_of(mesh, scene, camera, column + 0.5, row + 0.5)
+    hit = np.zeros(mask.shape, bool)
+    hit[row, column] = there
+    return Shown(hit, point, normal)
 
 
 def places_of(mesh: Mesh, scene, camera: Camera, x: np.ndarray, y: np.ndarray):
-    """hit (N,), corners, weights, points and normals (N, 3) of what positions (N,) in a picture show, as in `Shown`."""
+    """hit (N,), which of N positions in a picture show the mesh; and of these, (M, 3) each, the vertices of the face, their shares, the
+    point and the normal."""
     depth, face, uv = trace(scene, camera, x, y)
     hit = np.isfinite(depth)
-    corners, uv = mesh.faces[np.where(hit, face, 0)], np.where(hit[:, None], uv, 0)
-    weights = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], -1)
-    point, normal = ((of[corners] * weights[..., None]).sum(1).astype(np.float64) for of in (mesh.vertices, mesh.normals))
+    corners, (u, v) = mesh.faces[face[hit]], uv[hit].T
+    weights = np.stack([1 - u - v, u, v], -1)
+    point, normal = (np.einsum("ik,ikc->ic", weights, of[corners], dtype=np.float64) for of in (mesh.vertices, mesh.normals))
     return hit, corners, weights, point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
 
 
@@ -144,9 +177,13 @@ def flows_of(shown: Shown, here: np.ndarray, there: np.ndarray, both: np.ndarray
     (top, bottom), (left, right) = ((a.min(), a.max() + 1) for a in np.nonzero(both))
     box = np.s_[top:bottom, left:right]
     for mine, other in zip(np.moveaxis(here, -1, 0), np.moveaxis(there, -1, 0), strict=True):
+        contrast = contrasts(mine[box], both[box])
+        structure = structure_of(contrast, both[box])
+        if np.count_nonzero(structure) < LEAST:
+            continue
         brought = brought_to(shown, other, x, y)
-        flow, structure = confirmed_flow(contrasts(mine[box], both[box]), contrasts(brought[box], both[box]), both[box])
-        row, column = np.nonzero(structure)
+        flow, sure = confirmed_flow(contrast, contrasts(brought[box], both[box]), both[box])
+        row, column = np.nonzero(structure * sure)
         if len(row) < LEAST:
             continue
         chosen = np.unique(np.linspace(0, len(row) - 1, min(SAMPLES, len(row))).round().astype(int))
@@ -159,18 +196,31 @@ def shifts_of(mesh: Mesh, scene, i: int, j: int, camera: Camera, row, column, fl
     """Of view i against view j, from their flow (see `flows_of`). camera: of view i."""
     # where the other shows that place now
     hit, *places = places_of(mesh, scene, camera, column + 0.5 + flow[:, 0], row + 0.5 + flow[:, 1])
-    return Shifts(i, j, *(a[hit] for a in (*places, -flow, structure)))
+    return Shifts(i, j, *places, -flow[hit], structure[hit])
 
 
 def met_by(scene, shown: Shown, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((h, w) bool, which pixels of what a view shows a camera sees too, inside its mask; where it sees all that is hit, x and y (N,))."""
-    point = shown.point[shown.hit]
-    x, y, _ = camera.project(point).T
-    common = seen_points(scene, point, shown.normal[shown.hit], [camera], GRAZING)
-    common &= map_coordinates(mask, [y - 0.5, x - 0.5], order=1, mode="constant") > 0.9
+    return met_of(scene, shown, faced_by(shown, camera, mask))
+
+
+def faced_by(shown: Shown, camera: Camera, mask: np.ndarray) -> Faced:
+    """What of `met_by` needs no scene: pixels that a camera sees where nothing is in between."""
+    at = camera.project(shown.point)
+    x, y, _ = at.T
+    inside = map_coordinates(mask, [y - 0.5, x - 0.5], order=1, mode="constant") > 0.9
+    pixels = np.flatnonzero(inside & facing(shown.point, shown.normal, camera, at, GRAZING))
+    return Faced(pixels, x, y, sight_rays(shown.point[pixels], shown.normal[pixels], camera))
+
+
+def met_of(scene, shown: Shown, faced: Faced) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`met_by` of what a camera may see."""
+    common = np.zeros(len(shown.point), bool)
+    if len(faced.pixels):
+        common[faced.pixels] = clear(scene, *faced.rays)
     both = np.zeros(shown.hit.shape, bool)
     both[shown.hit] = common
-    return both, x, y
+    return both, faced.x, faced.y
 
 
 def brought_to(shown: Shown, picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -223,10 +273,7 @@ def structure_of(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 
 def confirmed_flow(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(flow (h, w, 2) with a(x) = b(x + flow), structure (h, w) where it is to be believed, else 0) of two pictures of contrasts."""
-    structure = structure_of(a, where)
-    if np.count_nonzero(structure) < LEAST:
-        return np.zeros((*a.shape, 2), np.float32), np.zeros_like(structure)
+    """(flow (h, w, 2) with a(x) = b(x + flow), (h, w) bool, where it is to be believed) of two pictures of contrasts."""
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     grey = [np.clip(40 * p + 128, 0, 255).astype(np.uint8) for p in (a, b)]
     flow, back = dis.calc(*grey, None), dis.calc(*grey[::-1], None)
@@ -240,4 +287,4 @@ def confirmed_flow(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> tuple[np.
     spread = np.maximum((around(a * a) - around(a) ** 2) * (around(c * c) - around(c) ** 2), 1e-6)
     alike = (around(a * c) - around(a) * around(c)) / np.sqrt(spread) > ALIKE
     stays = moved(where.astype(np.float32)) > 0.99
-    return flow, np.where(stays & returns & alike & (np.hypot(*np.moveaxis(flow, -1, 0)) < FARTHEST), structure, 0)
+    return flow, stays & returns & alike & (np.hypot(*np.moveaxis(flow, -1, 0)) < FARTHEST)

@@ -59,7 +59,6 @@ class Others:
     cameras: list[Camera]
     masks: list[np.ndarray]
     channels: list[np.ndarray]
-    shown: list[Shown]
     tint: np.ndarray
     clear: float
 
@@ -72,8 +71,7 @@ def others_of(mesh: Mesh, views: list[View], poses: np.ndarray) -> Others | None
     if not shifts:
         return None
     scene, tint = build_geometry(mesh), tint_of(pictures, masks)
-    shown = [shown_by(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
-    return Others(mesh, scene, cameras, masks, [channels_of(p, tint) for p in pictures], shown, tint, clear_of(shifts))
+    return Others(mesh, scene, cameras, masks, [channels_of(p, tint) for p in pictures], tint, clear_of(shifts))
 
 
 def turned_alike(others: Others, view: View, pose: np.ndarray, axis: Axis) -> np.ndarray:
@@ -95,10 +93,10 @@ def shrunk(view: View) -> View:
 
 
 def shrunk_others(others: Others) -> Others:
-    """As `shrunk`; what they show of the mesh is left out."""
+    """As `shrunk`."""
     masks, channels = [smaller(m) for m in others.masks], [smaller(c) for c in others.channels]
     cameras = [c.resized(m.shape[1], m.shape[0]) for c, m in zip(others.cameras, masks, strict=True)]
-    return replace(others, cameras=cameras, masks=masks, channels=channels, shown=[])
+    return replace(others, cameras=cameras, masks=masks, channels=channels)
 
 
 def smaller(picture: np.ndarray) -> np.ndarray:
@@ -182,7 +180,7 @@ def descended_alike(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
         before, shown = camera, shown_by(others.mesh, others.scene, camera, mask)
         cameras, cosines = [camera, *others.cameras], cosines_to(others, camera)
         near = [k + 1 for k in np.argsort(-cosines)[:NEIGHBOURS] if cosines[k] > np.cos(np.radians(ACROSS))]
-        pairs = [(0, k, shown, others.masks[k - 1]) for k in near] + [(k, 0, others.shown[k - 1], mask) for k in near]
+        pairs = [(0, k, shown, others.masks[k - 1]) for k in near]
         shifts = shifts_between(others.mesh, others.scene, pairs, cameras, channels)
         rows, _ = outline_rows(others.mesh, [camera], [view.mask], [view.known], LABELS, others.scene)
         rows += [replace(r, poses=[one for one in r.poses if one[0][0] == 0]) for r in (texture_rows(shifts, cameras) if shifts else [])]

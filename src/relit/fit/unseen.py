@@ -59,19 +59,33 @@ def seen_points(scene: mi.Scene, points: np.ndarray, normals: np.ndarray, camera
     """(N,) bool: points (N, 3) of the scene's surface, with unit normals (N, 3), that some camera sees under a cosine above `cosine`."""
     seen = np.zeros(len(points), bool)
     for camera in cameras:
-        x, y, depth = camera.project(points).T
-        to = camera.centre - points
-        far = np.linalg.norm(to, axis=1)
-        shown = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height) & ((normals * to).sum(1) > cosine * far)
-        asked = np.flatnonzero(shown & ~seen)
-        if len(asked) == 0:
-            continue
-        # width varies from camera to camera, which compiles nothing: launches of any width share a kernel
-        o, d = (points + OFFSET * normals)[asked], to[asked] / far[asked, None]
-        ray = mi.Ray3f(mi.Point3f(o.astype(np.float32).T), mi.Vector3f(d.astype(np.float32).T))
-        ray.maxt = mi.Float(far[asked].astype(np.float32))
-        seen[asked] = ~np.array(scene.ray_test(ray))
+        asked = np.flatnonzero(facing(points, normals, camera, camera.project(points), cosine) & ~seen)
+        if len(asked):
+            seen[asked] = clear(scene, *sight_rays(points[asked], normals[asked], camera))
     return seen
+
+
+def facing(points: np.ndarray, normals: np.ndarray, camera: Camera, at: np.ndarray, cosine: float) -> np.ndarray:
+    """(N,) bool: which of points (N, 3), with unit normals, lie within the picture, at (N, 3) of `Camera.project`, and are turned to the
+    camera by more than a cosine."""
+    x, y, depth = at.T
+    to = camera.centre - points
+    turned = np.einsum("ij,ij->i", normals, to) > cosine * np.sqrt(np.einsum("ij,ij->i", to, to))
+    return turned & (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+
+
+def sight_rays(points: np.ndarray, normals: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(origins (3, N), directions (3, N), lengths (N,)), float32, from just above points (N, 3) to a camera."""
+    to = camera.centre - points
+    far = np.sqrt(np.einsum("ij,ij->i", to, to))
+    return (points + OFFSET * normals).T.astype(np.float32), (to / far[:, None]).T.astype(np.float32), far.astype(np.float32)
+
+
+def clear(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """(N,) bool: rays, see `sight_rays`, that meet nothing. Their number compiles nothing: launches of any width share a kernel."""
+    ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions))
+    ray.maxt = mi.Float(lengths)
+    return ~np.array(scene.ray_test(ray))
 
 
 def face_pairs(faces: np.ndarray) -> np.ndarray:

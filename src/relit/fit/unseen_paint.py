@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_matrix, diags, identity
-from scipy.sparse.linalg import splu
 
+from relit.fit.sparse import solved_symmetric
 from relit.geometry.bake import fill_gutters, interpolate
 from relit.geometry.tangents import edges
 from relit.scene import Mesh
@@ -55,7 +55,7 @@ def continued(mesh: Mesh, seen: np.ndarray, texture: np.ndarray) -> np.ndarray:
         laplacian = (diags(np.asarray(near.sum(1)).ravel()) - near + LEAK * identity(count)).tocsr()
         mean = values[~free].mean(0)
         right = LEAK * mean - laplacian[free][:, ~free] @ values[~free]
-        values[free] = splu(laplacian[free][:, free].tocsc()).solve(right)
+        values[free] = solved_symmetric(laplacian[free][:, free], right)
     return values[place]
 
 
