@@ -63,7 +63,10 @@ def test_derivatives_are_those_of_the_projection(seen):
 def test_pictures_lie_on_each_other_where_all_is_right(seen):
     mesh, cameras, pictures, masks = seen
     shifts = texture_shifts(mesh, cameras, pictures, masks)
-    assert {(s.view, s.other) for s in shifts} == set(neighbours(cameras)) and len(neighbours(cameras)) >= 10 and misfit(shifts) < 0.15
+    pairs = neighbours(cameras)
+    assert {(s.view, s.other) for s in shifts} == set(pairs) and misfit(shifts) < 0.15
+    assert len(pairs) >= 10 and len({frozenset(pair) for pair in pairs}) == len(pairs)  # each once
+    assert len({first for first, _ in pairs}) == len(cameras)  # and each view is looked into
     assert misfit([]) == 0
 
 
