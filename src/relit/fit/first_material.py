@@ -44,6 +44,7 @@ TRIAL = {  # of the short fits
     "metallic_binary": 0.003,
 }
 MOST_EXCHANGE = 0.02  # of exchange_rate
+POINTS = 2048  # of a step, at most: the fits are coarse
 BATCHES = 8  # of pixels that the fits are judged by
 
 
@@ -73,7 +74,7 @@ def first_material(
         metallic, roughness = side
         first = o if roughness is None else replace(o, roughness_start=roughness)
         model = start_surface(small[0], small[1] > 0.5, radiance, first, None if normals is None else small[2], metallic)
-        fit_surface(bank, mesh, model, o, stage, seed)
+        fit_surface(bank, mesh, model, fewer_points(o), stage, seed)
         return errors(bank, mesh, model, o, centres, colour, seed)
 
     paint, metal = errors_from(SIDES[0]), errors_from(SIDES[1])
@@ -83,6 +84,11 @@ def first_material(
     is_metal, is_dull = explained_better(paint, metal, dull)
     metallic = np.where(is_metal[group] & known, METAL, PAINT)
     return metallic.astype(np.float32), np.where(is_dull[group] & known, DULL, options.roughness_start).astype(np.float32)
+
+
+def fewer_points(options: SurfaceOptions) -> SurfaceOptions:
+    """Options of a short fit; it is judged by as many points as the pass has."""
+    return replace(options, points=min(POINTS, options.points))
 
 
 def describe(metallic: np.ndarray, roughness: np.ndarray, known: np.ndarray) -> str:

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from relit.fit.first_material import TRIAL
+from relit.fit.first_material import TRIAL, fewer_points
 from relit.fit.instances import View
 from relit.fit.lit_pile import LitPile
 from relit.fit.loop import NoStage
@@ -113,7 +113,7 @@ class Body:
 
     def fit(self, o: SurfaceOptions, stage, seed: int) -> None:
         """A few steps of the surface pass, from one grey."""
-        fit_surface(self.pile.bank, self.pile.traced, self.model, o, stage, seed)
+        fit_surface(self.pile.bank, self.pile.traced, self.model, fewer_points(o), stage, seed)
 
     def texels_of(self, faces: np.ndarray) -> np.ndarray:
         """(S, S) bool: texels of faces (F,) bool."""
