@@ -1,12 +1,12 @@
 """Photos around an object under one fixed, unknown light -> a relightable asset. The recipe of the `multiview` capture.
 
-photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
-hull       visual hull of the masks, or without masks the fused depths of a radiance field of the whole scene   fit/explore.py
-volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
-mesh       zero level set, decimated; outlines as the masks have them, or without masks what the photos see; texture atlas;
-           mean radiance per vertex                                                              fit/outlines.py, fit/unseen.py
-surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/first_material.py, fit/surface.py
-asset      textures with filled gutters, everything back in the frame of the user's cameras
+    photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
+    hull       visual hull of the masks, or without masks the fused depths of a radiance field of the whole scene   fit/explore.py
+    volume     signed distance field and deferred appearance by volume rendering, coarse to fine     fit/volume.py
+    mesh       zero level set, decimated; outlines as the masks have them, or without masks what the photos see; texture atlas;
+               mean radiance per vertex                                                              fit/outlines.py, fit/unseen.py
+    surface    metallic-roughness textures and environment by Monte Carlo light transport            fit/first_material.py, fit/surface.py
+    asset      textures with filled gutters, everything back in the frame of the user's cameras
 """
 
 from __future__ import annotations
