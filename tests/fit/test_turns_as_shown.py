@@ -90,3 +90,14 @@ def test_where_two_turns_look_alike_the_one_it_has_stays(photographed, angle):
     begun = module.moved(alike, {7: np.linalg.inv(guess) @ pose})
     found = turned_as_shown(begun, [replace(view, rgb=picture * 0.9)], [camera], guess[None], AXIS)  # a light that is somewhat off
     assert rotation_angle(found[0][:3, :3] @ guess[:3, :3].T) < 3.0
+
+
+def test_a_picture_that_lies_a_pixel_aside_differs_no_more(photographed):
+    asset, camera, view, _ = photographed
+    scene = module.lit_scene(asset)
+    photo, solid = module.compared(view)
+    aside = module.moved_by(photo, np.array([[1, 0, 1.0], [0, 1, -0.8]]))
+    there, off = (module.difference(scene, camera, p, solid, 0) for p in (photo, aside))
+    plain = float(((aside - photo)[solid] ** 2).mean())
+    assert plain > 1e-3  # it would have counted
+    assert abs(off - there) < 0.1 * plain

@@ -2,8 +2,10 @@
 
 What is placed on its axis by its outline alone (fit/turn_guess.py) is turned by how much its picture looks like the others'. Under one
 light they hardly do: gloss and shading stand still while the paint turns. Rendered, every turn shows what it would look like, gloss and
-all; the one that differs least from the photo is taken. Where what it shows looks nearly the same at several turns, the materials'
-errors would choose: the turn it has stays then. Such an instance takes no part in shape and paint, before and after.
+all; the one that differs least from the photo is taken. The turn that an instance has was laid on its photo, while all others hang on an
+axis that is a little off, so that edges come to lie a pixel aside: each picture is laid on the photo before it is compared. Where what it
+shows looks nearly the same at several turns, the materials' errors would choose: the turn it has stays then. Such an instance takes no
+part in shape and paint, before and after.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 
 from relit.conventions import srgb_from_linear
 from relit.fit.instances import View
+from relit.fit.picture_alignment import laid_on, moved_by
 from relit.fit.turn_guess import turned_by
 from relit.geometry.revolution_axis import Axis
 from relit.rendering.mitsuba_scene import Scene, render
@@ -93,13 +96,14 @@ def compared(view: View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def difference(scene: Scene, camera: Camera, photo: np.ndarray, solid: np.ndarray, seed: int) -> float:
-    """Mean squared difference of what a camera sees from its photo, see `compared`; 0 where nothing is seen whole. The product of what two
-    pictures with samples of their own differ: the square of one would prefer what has less noise."""
+    """Mean squared difference of what a camera sees, laid on its photo, from that photo, see `compared`; 0 where nothing is seen whole. The
+    product of what two pictures with samples of their own differ: the square of one would prefer what has less noise."""
     if not solid.any():
         return 0.0
     small = camera.within(SIDE)
-    pictures = [render(scene, small, spp=SAMPLES, seed=2 * seed + k)[..., :3] for k in (0, 1)]
-    one, other = ((srgb_from_linear(np.clip(p, 0, 1)) - photo)[solid] for p in pictures)
+    pictures = [srgb_from_linear(np.clip(render(scene, small, spp=SAMPLES, seed=2 * seed + k)[..., :3], 0, 1)) for k in (0, 1)]
+    at = laid_on(sum(pictures) / 2, photo, solid)
+    one, other = ((moved_by(p, at) - photo)[solid] for p in pictures)
     return float((one * other).mean())
 
 
