@@ -208,3 +208,20 @@ def test_a_shape_that_is_wrong_bends_until_textures_agree():
         (apart(poses, cameras, mesh), misfit(texture_shifts(found, with_poses(cameras, poses), pictures, masks))) for found, poses in ends
     )
     assert before > EXACT > 2 * after and both < 0.6 * labels
+
+
+def test_most_textures_alone_are_not_believed_where_some_are_left_far_off(seen, monkeypatch):
+    """A wrong shape whose poses bend until most of the textures agree: it begins again from where labels have left it."""
+    mesh, cameras, pictures, masks = seen
+    one = texture_shifts(mesh, cameras, pictures, masks)[0]
+    some = np.arange(len(one.shift)) % 4 == 0
+    left = replace(one, structure=np.ones_like(one.structure), shift=np.where(some[:, None], [[2.0, 0.0]], [[0.1, 0.0]]))
+    before = replace(left, shift=np.full_like(one.shift, 5.0))
+    assert misfit([left]) == pytest.approx(0.1) and misfit([left], 0.9) == pytest.approx(2.0)
+    begun = []
+    monkeypatch.setattr(joint_alignment, "texture_shifts", lambda *_: [before])
+    monkeypatch.setattr(joint_alignment, "by_both", lambda mesh, placed, shifts, *rest: begun.append(shifts) or (mesh, placed, shifts))
+    for alone in (left, replace(left, shift=np.full_like(one.shift, 0.1))):
+        monkeypatch.setattr(joint_alignment, "by_textures", lambda mesh, placed, *_, alone=alone: (placed, [alone]))
+        follow_views(mesh, cameras, pictures, masks, everywhere(masks), 1)
+    assert begun[0][0] is before and begun[1][0] is not before

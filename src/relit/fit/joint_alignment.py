@@ -46,7 +46,8 @@ from relit.scene import Camera, Mesh
 EXACT = 0.7  # pixels by which textures may be off before they have a part in it
 TEXTURES, BOTH, SOFT = 6, 8, 16  # rounds: poses as textures have them, then poses and mesh as both have them, or both of a softer mesh
 SETTLED = 0.02  # degrees by which a pose turns in the last one
-SHARP, WHOLLY = 0.5, 0.2  # pixels that textures alone may leave, and share of what labels leave, before the shape is doubted
+NEARLY_ALL = 0.9  # of the shifts: a wrong shape can bring most of them, by poses that are far off, within half a pixel, but leaves these 2
+SHARP, WHOLLY = 1.0, 0.2  # pixels that textures alone may leave of these, and share of what labels leave, before the shape is doubted
 YIELDING = 150.0, 0.1  # of a softer mesh, in the place of STIFF and REST
 LABELS = 0.7  # pixels; what has contradicted textures is told no better than this
 FAINTEST = 0.15  # pixels; flow is told no better than this
@@ -85,7 +86,7 @@ def follow_views(
     if before <= EXACT:
         return outlined, poses, None
     placed, left = by_textures(outlined, start, shifts, pictures, masks)
-    if misfit(left) < min(SHARP, WHOLLY * before):
+    if misfit(left, NEARLY_ALL) < min(SHARP, WHOLLY * misfit(shifts, NEARLY_ALL)):
         found, placed, left = by_both(outlined, placed, left, pictures, masks, known, BOTH)
     else:  # not the labels, then: the shape
         found, placed, left = by_both(outlined, start, shifts, pictures, masks, known, SOFT, YIELDING)

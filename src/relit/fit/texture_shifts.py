@@ -114,13 +114,14 @@ def threads_of_pairs():
         cv2.setNumThreads(before)
 
 
-def misfit(shifts: list[Shifts]) -> float:
-    """Median length of the shifts in pixels, by what they count (see `shares`); 0 where there are none."""
+def misfit(shifts: list[Shifts], part: float = 0.5) -> float:
+    """Length in pixels that so large a part of the shifts does not exceed, by what they count (see `shares`), or their median; 0 where
+    there are none."""
     if not shifts:
         return 0.0
     length, weight = np.concatenate([np.linalg.norm(s.shift, axis=1) for s in shifts]), np.concatenate(shares(shifts))
     order = np.argsort(length)
-    return float(length[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
+    return float(length[order][np.searchsorted(np.cumsum(weight[order]), part * weight.sum())])
 
 
 def shares(shifts: list[Shifts]) -> list[np.ndarray]:
