@@ -279,9 +279,9 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     asked = []
 
     def passes(*told: tuple):
-        """(poses, odd, arrived, the last pass), asked for passes which turn all by so many degrees, and leave textures so far off; and
-        whether some were half a turn off then."""
-        names = ("turn", "off", "mixed")
+        """(poses, odd, arrived, the last pass), asked for passes which turn all by so many degrees, and leave textures so far off;
+        whether some were half a turn off then, and whether silhouettes bound one side only."""
+        names = ("turn", "off", "mixed", "one_sided")
         return told_passes(monkeypatch, asked, *(dict(zip(names, one, strict=False)) for one in told))[1:]
 
     poses, odd, arrived, last = passes((2, 3.0), (2, 2.0), (0.1, 1.5))
@@ -291,6 +291,9 @@ def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
     assert not passes((2, 3.0), (2, None))[2] and len(asked) == 2, "labels and textures agree"
     _, _, arrived, last = passes((2, 3.0), (2, 0.2))
     assert arrived and last.exact and len(asked) == 2, "textures lie on one another"
+    _, _, arrived, last = passes((2, 0.2, False, True), (2, 0.2, False, False))
+    assert arrived and last.symmetry == 2, "silhouettes bounded it from one side only"
+    assert passes((0.1, 0.2, False, True))[2] and len(asked) == 1, "it has not moved"
     assert passes((2, 0.6), (2, 0.55))[2] and len(asked) == 2, "textures come no closer"
     assert passes((2.4, 0.32), (0.8, 0.28), (0.4, 0.17))[2] and len(asked) == 3, "an eighth closer is still on the way"
     assert passes((0.1, 0.2, True), (2, 0.3), (2, 0.2))[2] and len(asked) == 3, "what was mixed tells nothing of what follows"
@@ -317,13 +320,13 @@ def test_who_is_found_in_the_last_pass_takes_part_in_more(monkeypatch):
 
 
 def test_a_pass_is_kept_whole():
-    one = pose_passes.Pass(np.ones((2, 4, 4)), np.array([True, False]), np.array([0.1, 0.2]), 1.5, None, None, True, {7: np.eye(4)})
+    one = pose_passes.Pass(np.ones((2, 4, 4)), np.array([True, False]), np.array([0.1, 0.2]), 1.5, None, None, True, True, {7: np.eye(4)})
     again = pose_passes.pass_from(one.arrays)
-    assert again.off is None and again.symmetry is None and again.mixed and again.turn == 1.5
+    assert again.off is None and again.symmetry is None and again.mixed and again.one_sided and again.turn == 1.5
     assert np.array_equal(again.errors, one.errors) and np.array_equal(again.odd, one.odd) and list(again.found) == [7]
     assert np.array_equal(again.found[7], np.eye(4)) and not pose_passes.pass_from(replace(one, found={}).arrays).found
-    old = pose_passes.pass_from({k: v for k, v in one.arrays.items() if k not in ("errors", "found", "there", "mixed")})
-    assert not old.found and not old.mixed and np.isnan(old.errors).all() and len(old.errors) == 2
+    old = pose_passes.pass_from({k: v for k, v in one.arrays.items() if k not in ("errors", "found", "there", "mixed", "one_sided")})
+    assert not old.found and not old.mixed and not old.one_sided and np.isnan(old.errors).all() and len(old.errors) == 2
 
 
 def test_who_joins_is_sought_where_few_are_left_out(monkeypatch):

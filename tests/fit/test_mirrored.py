@@ -19,6 +19,7 @@ from relit.fit.loop import NoStage
 from relit.fit.mirrored import MirroredRays, Symmetry, even_pixels, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
 from relit.fit.outlines import trace
 from relit.fit.pixels import RayBatch
+from relit.fit.pose_passes import bounded_from_one_side
 from relit.fit.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
@@ -109,6 +110,11 @@ def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
     found = find_symmetry(two, large, poses)
     assert found is not None and abs(found.plane.normal[0]) > 0.999 and abs(found.plane.offset) < 0.005
     assert find_symmetry(two, small, poses) is None
+    first, next_one = SimpleNamespace(symmetry=None), SimpleNamespace(symmetry=found)
+    assert bounded_from_one_side(two, found, None) and bounded_from_one_side(two, found, first)
+    assert not bounded_from_one_side(two, found, next_one) and not bounded_from_one_side(two, None, None)
+    round_one = body(((0.3, 0.5, 0.3), (0, 0, 0)))  # its mirror images show nothing new
+    assert not bounded_from_one_side(round_one, Symmetry(ACROSS, round_one), None)
     kept = symmetry_from({"poses": np.eye(4), **found.arrays})
     assert np.array_equal(kept.plane.mirror, found.plane.mirror) and np.array_equal(kept.mesh.faces, two.faces)
     assert build_geometry(kept.mesh) is not None and symmetry_from({"poses": np.eye(4)}) is None

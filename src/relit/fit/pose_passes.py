@@ -51,7 +51,9 @@ class Pass:
     """What a volume pass for the poses alone gives. poses: (N, 4, 4). odd: (N,) bool, who shows what does not agree with the model of all.
     errors: (N,) squared differences, see `view_errors`. turn: degrees by which it has turned the instances, the median. off: pixels, see
     `followed`. symmetry: of its shape; None where that is not even. mixed: whether instances were turned then by which the object nearly
-    looks like itself: what it has built is of no use. found: poses, by key, of those who are to take part in the next."""
+    looks like itself: what it has built is of no use. one_sided: whether the shape has turned out to be its own mirror image, and
+    silhouettes bounded it from one side only; a body of revolution has no other side. found: poses, by key, of those who are to take part
+    in the next."""
 
     poses: np.ndarray
     odd: np.ndarray
@@ -60,6 +62,7 @@ class Pass:
     off: float | None
     symmetry: Symmetry | None
     mixed: bool = False
+    one_sided: bool = False
     found: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -74,6 +77,7 @@ class Pass:
             "errors": self.errors,
             "turn": self.turn,
             "mixed": self.mixed,
+            "one_sided": self.one_sided,
             **who,
             **off,
             **symmetry,
@@ -86,20 +90,28 @@ class Pass:
 
     def arrived(self, last: Pass | None) -> bool:
         """Whether another one would only lead the poses away again: textures brought them back to where they had been before, or as close
-        together as flow can tell, or hardly closer than in the pass before."""
+        together as flow can tell on a shape that silhouettes bound from both sides, where it has two, or hardly closer than in the pass
+        before."""
         if self.off is None or self.mixed:
             return False
         settled = last is not None and last.off is not None and not last.mixed and self.off > CLOSER * last.off
-        return settled or self.turn < ARRIVED or self.exact
+        return settled or self.turn < ARRIVED or (self.exact and not self.one_sided)
 
 
 def pass_from(saved: dict[str, np.ndarray]) -> Pass:
     """The pass that a stage has kept."""
-    nothing = {"mixed": False, "errors": np.full(len(saved["poses"]), np.nan), "found": np.zeros(0, int), "there": np.zeros((0, 4, 4))}
+    nothing = {
+        "mixed": False,
+        "one_sided": False,
+        "errors": np.full(len(saved["poses"]), np.nan),
+        "found": np.zeros(0, int),
+        "there": np.zeros((0, 4, 4)),
+    }
     saved = nothing | saved  # runs of before have less
     off = float(saved["off"]) if "off" in saved else None
     found = dict(zip(saved["found"].tolist(), saved["there"], strict=True))
-    return Pass(saved["poses"], saved["odd"], saved["errors"], float(saved["turn"]), off, symmetry_from(saved), bool(saved["mixed"]), found)
+    mixed, one_sided = bool(saved["mixed"]), bool(saved["one_sided"])
+    return Pass(saved["poses"], saved["odd"], saved["errors"], float(saved["turn"]), off, symmetry_from(saved), mixed, one_sided, found)
 
 
 def joint_stages(views: list[View], poses: np.ndarray, others: list[View], seek: Callable, run, options: DuplicatesOptions, seed: int):
@@ -176,11 +188,17 @@ def joint_stage(
             run.say("the object is its own mirror image: its silhouettes bound it from both sides")
         if turned is not None:
             poses[~odd] = turned
-        one = Pass(poses, odd, errors, turn, off, symmetry, turned is not None)
+        one = Pass(poses, odd, errors, turn, off, symmetry, turned is not None, bounded_from_one_side(mesh, symmetry, last))
         if seek and turned is None and (off is None or one.arrived(last) or final):
             one = replace(one, found=seek(some, built[~odd], poses[~odd], model, mesh, float(np.nanmedian(errors))))
         stage.save("joint", **one.arrays)
     return one
+
+
+def bounded_from_one_side(mesh: Mesh, symmetry: Symmetry | None, last: Pass | None) -> bool:
+    """See `Pass.one_sided`. mesh, symmetry: of a pass. last: the one before, or None."""
+    news = symmetry is not None and (last is None or last.symmetry is None)
+    return news and body_axis(mesh) is None
 
 
 def told_apart(mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int) -> np.ndarray | None:
