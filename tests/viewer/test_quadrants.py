@@ -75,6 +75,10 @@ def test_guesses_of_a_finished_run(capture, tmp_path):
     path = ask_in_terminal(capture, lambda text: typed[text.split()[0]], lambda _: None, guesses)
     said = {f["image_name"]: f["quadrant"] for f in json.loads(path.read_text())["frames"]}
     assert said == {"0.png": guesses["0.png"], "1.png": ["Center", "Center", "Back"]}
+
+
+def test_the_page_begins_with_the_guesses(built, capture):
+    guesses = {"0.png": ["Left", "Center", "Front"], "1.png": ["Center", "Above", "Center"], "2.png": ["Right", "Center", "Center"]}
     server = quadrant_server(capture, guesses=guesses)
     try:
         assert [p["guess"] for p in server.answers["quadrants"]()["photos"]] == list(guesses.values())
@@ -82,7 +86,7 @@ def test_guesses_of_a_finished_run(capture, tmp_path):
         server.server_close()
 
 
-def test_page(capture):
+def test_page(built, capture):
     server = quadrant_server(capture)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
