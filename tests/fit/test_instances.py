@@ -18,7 +18,7 @@ from relit.fit.instance_lookup import look_for
 from relit.fit.instance_options import DETAILED, Growth, Search
 from relit.fit.instance_regrowth import Placed, believed, confirmed, improved, judged, staying
 from relit.fit.instance_rounds import LOW, ambiguous, crops_of, nearer, reconsider, regrown, settled, trusted
-from relit.fit.instance_search import TORN, first_starts, place, without_torn
+from relit.fit.instance_search import TORN, first_starts, grown_from_pairs, place, without_torn
 from relit.fit.instances import (
     albedo_render,
     carved,
@@ -192,6 +192,32 @@ def test_growing_again_ends_with_the_best_agreement(monkeypatch):
     best = improved(views, crops, rings, begun, o, seed=0, say=said.append)
     assert np.array_equal(best.poses, truth) and best.agreement > begun.agreement + 0.02
     assert any("grown again" in text for text in said) and best.unsure
+
+
+@pytest.mark.parametrize(("firm", "sought"), [((0, 1, 2, 3), "all but the last two"), ((0, 1), "another pair")])
+def test_what_most_of_a_growth_was_sure_of_stays_before_another_start_is_made(monkeypatch, firm, sought):
+    """The first growth leaves two wrong and says so; what grows from most that were sure is right. The judge is real."""
+    from relit.fit import instance_regrowth, instance_search
+
+    views, truth = painted([0, 20, 40, 60, 80, 100])
+    wrong = similarity(exp_so3(np.array([0.0, np.radians(110), 0.0])), np.zeros(3))
+    start = np.array([wrong @ p if k > 3 else p for k, p in enumerate(truth)])
+    grown_from = []
+
+    def grown(views, crops, rings, parts, stay, poses, *_, **__):
+        grown_from.append(list(stay))
+        if len(grown_from) == 1:
+            return Grown(start.copy(), np.ones(6), firm, tuple(k for k in range(6) if k not in firm))
+        return Grown(truth.copy(), np.ones(6), tuple(range(6)), ())
+
+    monkeypatch.setattr(instance_search, "grow", grown)
+    monkeypatch.setattr(instance_regrowth, "grow", grown)
+    monkeypatch.setattr(instance_search, "confirmed", lambda views, crops, rings, placed, o, **_: placed)
+    monkeypatch.setattr(instance_search, "pair_guesses", lambda *_: {DETAILED: None})
+    monkeypatch.setattr(instance_search, "first_starts", lambda *_: [([0, 1], truth), ([2, 3], truth)])
+    best = grown_from_pairs(views, crops_of(views), None, Search(nodes=24, steps=12, starts=2))
+    assert grown_from == [[0, 1], [0, 1, 2, 3] if sought == "all but the last two" else [2, 3]]
+    assert np.array_equal(best.poses, truth) and not best.unsure
 
 
 def test_what_is_believed_was_sure_of_its_places_and_agrees_all_over():

@@ -6,7 +6,8 @@ borne_out      what matching has linked, as far as silhouettes and paint bear it
 grow           one instance after another joins those that stand already (fit/instance_growth.py); from several pairs, the best counts
 up_to_turns    where instances were not sure of their places: those turned that the silhouettes ask for, if the object nearly looks like
                itself when it is turned (fit/instance_turns.py)
-improved       where they are not yet sure: taken out and grown again, another way each time (fit/instance_regrowth.py)
+improved       where they are not yet sure: taken out and grown again, another way each time (fit/instance_regrowth.py); once, where most
+               of a growth was sure, before it starts from another pair
 settled        rounds of a coarse model of all and a search for all poses by rendering it, descents, doubt (fit/instance_rounds.py)
 coherent_turns as up_to_turns, of the poses that have come out
 """
@@ -22,7 +23,7 @@ from relit.fit.instance_guesses import Guesses, first_pairs, pair_guesses
 from relit.fit.instance_links import borne_out, linked_sets
 from relit.fit.instance_lookahead import Branch, branch_values
 from relit.fit.instance_options import DETAILED, Search
-from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged
+from relit.fit.instance_regrowth import NO_GAIN, Placed, believed, confirmed, improved, judged, mostly_firm
 from relit.fit.instance_revolution import mostly_sure, place_revolved
 from relit.fit.instance_rounds import descend, settled
 from relit.fit.instance_turns import coherent_turns, stands
@@ -148,10 +149,11 @@ def grown_from_pairs(
     say=lambda text: None,
     step=lambda done, total: None,
 ) -> Placed | None:
-    """What growth makes of pairs, as far as it is better than `best`; None where nothing agrees with the silhouettes."""
+    """What growth makes of pairs, as far as it is better than `best`; None where nothing agrees with the silhouettes. Where one is not
+    believed, but most of it stood before the first doubt, the others are grown again before another start is made."""
     chosen = best_seen(views)[: o.models]
     guesses = pair_guesses(views, crops, chosen, o, frame_scale(views), seed, step)
-    rings = {parts: crop_rings(crops, parts) for parts in guesses}
+    rings, detailed = {parts: crop_rings(crops, parts) for parts in guesses}, crop_rings(crops, DETAILED)
     starts = {parts: first_starts(views, crops, rings[parts], parts, some, chosen, links, o, seed) for parts, some in guesses.items()}
     for turn in range(o.starts):
         for parts in starts:
@@ -170,6 +172,8 @@ def grown_from_pairs(
                 f"grown from {' and '.join(str(views[k].label) for k in start)}: {len(views) - len(placed.unsure)} sure of their places, "
                 f"agreement of all with a model of all {placed.agreement:.3f}"
             )
+            if not believed(placed, o) and mostly_firm(placed):
+                placed = improved(views, crops, detailed, placed, o, seed=seed + 40 + turn, tries=1, links=links, say=say)
             if best is None or placed.agreement > best.agreement - (NO_GAIN if believed(placed, o) else 0):
                 best = placed
     return best
