@@ -1,6 +1,7 @@
 # make setup | demo | test | lint | bench | viewer | validator | dist | clean
 VENV ?= .venv
 NICE ?=
+WORKERS ?= 2
 SUITES ?= multiview flash duplicates collection
 
 .PHONY: setup demo test lint bench viewer validator dist clean
@@ -14,8 +15,9 @@ setup:
 demo: setup
 	$(NICE) $(VENV)/bin/python -m relit demo -o runs/demo
 
+# files of tests side by side, one thread each
 test: setup validator viewer
-	$(NICE) $(VENV)/bin/python -m pytest -q
+	$(NICE) $(VENV)/bin/python -m pytest -q -n $(WORKERS) --dist loadfile
 
 lint: setup
 	$(VENV)/bin/python -m ruff check src tests benchmarks

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")
+PARALLEL = "PYTEST_XDIST_WORKER" in os.environ  # tests run side by side, each on one thread
+os.environ.setdefault("OMP_NUM_THREADS", "1" if PARALLEL else "2")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -15,7 +18,29 @@ def device() -> str:
     """Mitsuba's variant is set before anything touches its types; `RELIT_TEST_DEVICE` may name `cuda`."""
     from relit.device import use_device
 
-    return use_device(os.environ.get("RELIT_TEST_DEVICE", "cpu"))
+    variant = use_device(os.environ.get("RELIT_TEST_DEVICE", "cpu"))
+    if PARALLEL:
+        import drjit as dr
+
+        dr.set_thread_count(1)
+    return variant
+
+
+@pytest.fixture
+def load_scene(device) -> Callable[[Path], Any]:
+    """`mitsuba.load_file`, which waits for itself for ever where Dr.Jit has one thread."""
+    import drjit as dr
+    import mitsuba as mi
+
+    def load(path: Path) -> Any:
+        threads = dr.thread_count()
+        dr.set_thread_count(max(threads, 2))
+        try:
+            return mi.load_file(str(path))
+        finally:
+            dr.set_thread_count(threads)
+
+    return load
 
 
 @pytest.fixture(scope="session")

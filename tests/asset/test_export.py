@@ -74,10 +74,10 @@ def test_ply_has_the_colours(folder, tmp_path):
     assert np.ptp(red) > 100
 
 
-def test_mitsuba_scene_renders_like_the_asset(folder, asset, tmp_path):
+def test_mitsuba_scene_renders_like_the_asset(folder, asset, tmp_path, load_scene):
     files = export_asset(folder, "mitsuba", tmp_path / "scene")
     assert {"scene.xml", "object.ply", "environment.exr", "base_color.png"} <= {p.name for p in files}
-    scene = mi.load_file(str(tmp_path / "scene" / "scene.xml"))
+    scene = load_scene(tmp_path / "scene" / "scene.xml")
     picture = np.array(mi.render(scene, spp=64))
     m, t = read_asset_file(folder / "object.glb")
     ours = render(build_scene(m, t, asset.world_from_asset, asset.environment, bsdf="principled"), asset.cameras[0][1], spp=64)
@@ -88,7 +88,7 @@ def test_mitsuba_scene_renders_like_the_asset(folder, asset, tmp_path):
     assert np.abs(a.mean(0) - b.mean(0)).max() < 0.01
 
 
-def test_mitsuba_scene_of_a_rough_plastic_renders_like_the_asset(asset, tmp_path):
+def test_mitsuba_scene_of_a_rough_plastic_renders_like_the_asset(asset, tmp_path, load_scene):
     from relit.rendering.flash_scene import build_flash_scene, render_flash
 
     size = asset.material.base_color.shape[:2]
@@ -98,7 +98,7 @@ def test_mitsuba_scene_of_a_rough_plastic_renders_like_the_asset(asset, tmp_path
     flash = Flash(np.array([-0.2, -0.1, 0.0]), np.full(3, 3 * float(np.sum(camera.centre**2))))
     plastic = replace(asset, material=material, flash=flash, environment=None)
     write_mitsuba(tmp_path / "scene", plastic)
-    picture = np.array(mi.render(mi.load_file(str(tmp_path / "scene" / "scene.xml")), spp=64))[..., :3]
+    picture = np.array(mi.render(load_scene(tmp_path / "scene" / "scene.xml"), spp=64))[..., :3]
     ours = render_flash(build_flash_scene(plastic.mesh, material, plastic.world_from_asset), camera, flash, 64, max_depth=6)
     inside = ours[..., 3] > 0.999
     a, b = picture[inside].clip(0, 1), ours[..., :3][inside].clip(0, 1)

@@ -73,15 +73,13 @@ def test_a_lost_diffuse_albedo_is_told(tmp_path, plastic):
         load_asset(folder)
 
 
-def test_mitsubas_plastic_takes_the_diffuse_albedo(tmp_path, plastic):
+def test_mitsubas_plastic_takes_the_diffuse_albedo(tmp_path, plastic, load_scene):
     folder = save_asset(tmp_path / "asset", plastic)
     export_asset(folder, "mitsuba", tmp_path / "scene")
     text = (tmp_path / "scene" / "scene.xml").read_text()
     assert "textures/diffuse_albedo.exr" in text and "base_color.png" not in text
     np.testing.assert_allclose(read_data(tmp_path / "scene" / "textures" / "diffuse_albedo.exr"), plastic.material.diffuse, atol=1e-3)
-    import mitsuba as mi
-
-    assert mi.load_file(str(tmp_path / "scene" / "scene.xml")) is not None
+    assert load_scene(tmp_path / "scene" / "scene.xml") is not None
 
 
 def test_editing_keeps_both_together(tmp_path, plastic):
