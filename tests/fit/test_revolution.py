@@ -72,6 +72,13 @@ def bottles():
     return views, crops, poses, body, seats_of(crops, body)
 
 
+@pytest.fixture(scope="module")
+def told(bottles) -> Told:
+    """Their turns about the axis, by decoration."""
+    views, _, _, body, seats = bottles
+    return turned_by_decoration(views, body.profile, seats)["colour and brightness"]
+
+
 def off_axis(pose: np.ndarray, truth: np.ndarray, sign: float) -> float:
     return float(np.degrees(np.arccos(np.clip(sign * axis_of(pose) @ axis_of(truth), -1, 1))))
 
@@ -91,10 +98,8 @@ def test_outlines_tell_the_axes(bottles):
     assert np.median([len(some) for some in seats]) <= 2
 
 
-def test_decoration_tells_the_turns_about_them(bottles):
-    views, _, poses, body, seats = bottles
-    told = turned_by_decoration(views, body.profile, seats)["colour and brightness"]
-    off = wrong_by(told.poses, poses)
+def test_decoration_tells_the_turns_about_them(bottles, told):
+    off = wrong_by(told.poses, bottles[2])
     assert (off < 12).sum() >= 5, off
     assert (off[told.sure] < 20).all(), (off, told.sure)  # those that say that they are sure are right
     assert told.sure.sum() >= 4, told.sure
@@ -153,11 +158,10 @@ def test_a_turn_about_the_axis_leaves_the_axis(bottles):
     assert np.allclose(axis_of(turned), axis_of(pose)) and np.isclose(rotation_angle(turned[:3, :3] @ pose[:3, :3].T), np.degrees(0.7))
 
 
-def placed(bottles, monkeypatch, sure):
+def placed(bottles, told, monkeypatch, sure):
     """(what the search finds, what it has said), of bottles some of which are sure of what decoration tells."""
     views, _, _, body, seats = bottles
     said: list[str] = []
-    told = turned_by_decoration(views, body.profile, seats)["colour and brightness"]
     monkeypatch.setattr("relit.fit.instance_revolution.fit_revolution", lambda *a: body)
     monkeypatch.setattr("relit.fit.instance_revolution.seats_of", lambda *a: seats)
     monkeypatch.setattr("relit.fit.instance_revolution.turned_by_decoration", lambda *a: {"colour": Told(told.poses, sure)})
@@ -168,33 +172,33 @@ def placed(bottles, monkeypatch, sure):
     return found, said
 
 
-def test_bodies_of_revolution_that_are_sure_are_not_searched(bottles, monkeypatch):
+def test_bodies_of_revolution_that_are_sure_are_not_searched(bottles, told, monkeypatch):
     monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses"))
-    found, _ = placed(bottles, monkeypatch, np.ones(7, bool))
+    found, _ = placed(bottles, told, monkeypatch, np.ones(7, bool))
     assert found.sure
 
 
-def test_of_bodies_of_revolution_that_are_mostly_sure_the_others_are_left_to_the_end(bottles, monkeypatch):
+def test_of_bodies_of_revolution_that_are_mostly_sure_the_others_are_left_to_the_end(bottles, told, monkeypatch):
     monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses"))
     for name in ("confirmed", "settled"):  # which could lose the axes
         monkeypatch.setattr(instance_search, name, lambda *a, **k: pytest.fail("a search over all poses"))
-    found, said = placed(bottles, monkeypatch, np.arange(7) > 1)
+    found, said = placed(bottles, told, monkeypatch, np.arange(7) > 1)
     assert (np.flatnonzero(found.scores == instance_search.LEFT_OUT) == [0, 1]).all()
     assert any("2 of 7 are not sure" in text for text in said)
 
 
-def test_bodies_of_revolution_that_are_not_sure_keep_their_axes_where_the_search_finds_nothing(bottles, monkeypatch):
+def test_bodies_of_revolution_that_are_not_sure_keep_their_axes_where_the_search_finds_nothing(bottles, told, monkeypatch):
     asked = []
     monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: asked.append(1) or {})
     monkeypatch.setattr("relit.fit.instance_revolution.flat", lambda poses: False)
-    _, said = placed(bottles, monkeypatch, np.zeros(7, bool))
+    _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
     assert asked and any("7 of 7 are not sure" in text for text in said)
 
 
-def test_bodies_of_revolution_on_one_plane_are_not_searched_whether_they_are_sure_or_not(bottles, monkeypatch):
+def test_bodies_of_revolution_on_one_plane_are_not_searched_whether_they_are_sure_or_not(bottles, told, monkeypatch):
     monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses"))
     monkeypatch.setattr("relit.fit.instance_revolution.flat", lambda poses: True)
-    _, said = placed(bottles, monkeypatch, np.zeros(7, bool))
+    _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
     assert any("7 of 7 are not sure" in text for text in said)
 
 
