@@ -153,7 +153,7 @@ def grown_from_pairs(
     believed, but most of it stood before the first doubt, the others are grown again before another start is made."""
     chosen = best_seen(views)[: o.models]
     guesses = pair_guesses(views, crops, chosen, o, frame_scale(views), seed, step)
-    rings, detailed = {parts: crop_rings(crops, parts) for parts in guesses}, crop_rings(crops, DETAILED)
+    rings = {parts: crop_rings(crops, parts) for parts in {*guesses, DETAILED}}
     starts = {parts: first_starts(views, crops, rings[parts], parts, some, chosen, links, o, seed) for parts, some in guesses.items()}
     for turn in range(o.starts):
         for parts in starts:
@@ -173,7 +173,7 @@ def grown_from_pairs(
                 f"agreement of all with a model of all {placed.agreement:.3f}"
             )
             if not believed(placed, o) and mostly_firm(placed):
-                placed = improved(views, crops, detailed, placed, o, seed=seed + 40 + turn, tries=1, links=links, say=say)
+                placed = improved(views, crops, rings[DETAILED], placed, o, seed=seed + 40 + turn, tries=1, links=links, say=say)
             if best is None or placed.agreement > best.agreement - (NO_GAIN if believed(placed, o) else 0):
                 best = placed
     return best
