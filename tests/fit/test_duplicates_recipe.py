@@ -92,15 +92,24 @@ def test_objects_of_a_heap_lie_on_one_another():
     assert len(gaps) >= 3 and max(gaps) < 0.06 * RADIUS  # a tenth and more on a height field of a third of the detail
 
 
+def said_of_sides(*degrees) -> list[str]:
+    """What is said of objects, labels 1, 2, ..., that are seen from so many degrees around an axis."""
+    said, turns = [], [exp_so3(np.array([0, np.radians(a), 0])) for a in degrees]
+    views = [SimpleNamespace(label=k + 1, photo=0) for k in range(len(turns))]
+    poses_stage.say_far_apart(views, np.array([similarity(t, t @ [0, 0, -5.0]) for t in turns]), SimpleNamespace(say=said.append))
+    return said
+
+
 def test_objects_that_show_too_different_sides_are_said():
-    said = []
-    run = SimpleNamespace(say=said.append)
-    turns = [exp_so3(np.array([0, np.radians(a), 0])) for a in (0, 20, 40, 60)]
-    poses_stage.say_far_apart(np.array([similarity(t, t @ [0, 0, -5.0]) for t in turns]), run)
-    assert not said
-    turns = [exp_so3(np.array([0, np.radians(a), 0])) for a in (0, 70, 140)]
-    poses_stage.say_far_apart(np.array([similarity(t, t @ [0, 0, -5.0]) for t in turns]), run)
+    assert not said_of_sides(0, 20, 40, 60)
+    assert not said_of_sides(0, 0, 40, 80, 120, 160)  # opposite sides, and others between
+    said = said_of_sides(0, 70, 140)
     assert len(said) == 1 and "lie 70 degrees apart" in said[0]
+
+
+def test_two_groups_of_sides_that_share_nothing_are_said():
+    said = said_of_sides(0, 160, 10, 170, 20)
+    assert len(said) == 1 and "labels 1, 3, 5 and labels 2, 4 " in said[0] and "140 degrees apart" in said[0]
 
 
 def test_without_the_search_one_set_that_matches_hold_together_is_left():

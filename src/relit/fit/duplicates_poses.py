@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from relit.cameras.se3 import rotation_angle
 from relit.errors import EXIT_FAILED, UserError
@@ -25,6 +25,7 @@ from relit.run import run_arrays
 from relit.scene import Camera, Pixels
 
 FAR = 45.0  # degrees between what an object shows and what the next one does from which on the search is often wrong
+APART = 100.0  # degrees between two groups of sides from which on hardly anything is shown by both
 AGREES = 0.2  # an instance whose score lies further below the median did not find its place
 
 Shot = tuple[Pixels, Camera]  # a decoded photo and its camera in its own frame (identity pose)
@@ -71,7 +72,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
         if registered.sum() > 2 and "refinement" not in options.without:
             unsure[registered] = ambiguous([v for v, ok in zip(views, registered, strict=True) if ok], poses[registered], search, seed=seed)
             say_ambiguous(views, unsure, int(registered.sum()), run)
-        say_far_apart(poses[registered], run)
+        say_far_apart([v for v, ok in zip(views, registered, strict=True) if ok], poses[registered], run)
         if matched and not {"guided", "refinement"} & set(options.without):
             poses = adjusted_poses(matched, poses, registered, run)
         poses = centred(views, poses, registered)
@@ -102,18 +103,35 @@ def say_ambiguous(views: list[View], unsure: np.ndarray, registered: int, run) -
         )
 
 
-def say_far_apart(poses: np.ndarray, run) -> None:
-    """Say where the objects (N, 4, 4) show sides so different that their poses are uncertain whatever their scores."""
+def say_far_apart(views: list[View], poses: np.ndarray, run) -> None:
+    """Say where the objects, at poses (N, 4, 4), show sides so different that their poses are uncertain whatever their scores."""
     sides = seen_from(poses)
     if len(sides) < 2:
         return
-    away = np.degrees(np.arccos(np.clip(sides @ sides.T, -1, 1))) + 360 * np.eye(len(sides))
-    apart = np.median(away.min(1))
+    away = np.degrees(np.arccos(np.clip(sides @ sides.T, -1, 1)))
+    apart = np.median((away + 360 * np.eye(len(sides))).min(1))
     if apart > FAR:
         run.say(
             f"note: the sides that the objects show lie {apart:.0f} degrees apart (each from the next one, median), and the search is "
             f"often wrong beyond {FAR:.0f}: look at the rendered photo in the report; more objects or another photo of the pile help"
         )
+    gap, group = widest_gap(away)
+    if gap > APART and len(sides) > 2:
+        one, other = (", ".join(named(v).removeprefix("label ") for v, g in zip(views, group, strict=True) if g == n) for n in (0, 1))
+        run.say(
+            f"note: labels {one} and labels {other} are placed as showing opposite sides of the object, {gap:.0f} degrees apart with none "
+            "between: each group may agree with itself and yet be turned against the other; look at the object in the report; more objects "
+            "or another photo of the pile help"
+        )
+
+
+def widest_gap(away: np.ndarray) -> tuple[float, np.ndarray]:
+    """(degrees, group (N,) 0 or 1): the widest step that going from each side to the next cannot avoid, and what lies on its two ends.
+    away: (N, N) degrees between the sides of N >= 2 objects."""
+    tree = minimum_spanning_tree(np.maximum(away, 1e-3)).toarray()  # 0 would be no edge
+    gap = tree.max()
+    tree[np.unravel_index(tree.argmax(), tree.shape)] = 0
+    return float(gap), connected_components(tree, directed=False)[1]
 
 
 def named(view: View) -> str:
