@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
 from relit.fit import instance_search
-from relit.fit.beside import turned_by_outline
+from relit.fit.beside import EMPTY, FILLED_OR_EMPTY, SHOWN, filled, turned_by_outline
 from relit.fit.instance_options import Search
 from relit.fit.instance_revolution import EXACT, flat, place_revolved
 from relit.fit.instances import View, crops_of
 from relit.fit.register import crop_rings
 from relit.fit.revolution import KNOTS, OUTLINE, axis_of, drawn, leaning_back
 from relit.fit.revolution_fit import Revolved, adjusted_pose, fit_revolution, fitted, leaning_the_other_way, outline_of, seats_of
-from relit.fit.turns import Board, Told, turned_about
-from relit.fit.unrolled import LATITUDES, TURNS, cells_of, one_value, turned_by_decoration
+from relit.fit.turns import Told, cells_read, empty_board, turned_about
+from relit.fit.unrolled import LATITUDES, ONE_VALUE, TURNS, cells_of, one_value, turned_by_decoration
 from relit.scene import Camera
 
 SIDE, FOCAL, AWAY = 96, 190.0, 4.0
@@ -142,7 +142,7 @@ def test_two_maps_of_one_decoration_are_laid_on_each_other():
     values /= values.std()
     shown = np.ones((LATITUDES, TURNS), bool)
     shown[:, 70:] = False
-    board = Board(one_value, np.zeros(LATITUDES * TURNS), np.zeros(LATITUDES * TURNS))
+    board = empty_board(ONE_VALUE, (LATITUDES, TURNS))
     board.lay(cells_of(shown, values), 0)
     before = board.total.copy()
     gains = board.gains(cells_of(np.roll(shown, -17, 1), np.roll(values, -17, 2)))
@@ -150,6 +150,31 @@ def test_two_maps_of_one_decoration_are_laid_on_each_other():
     board.lay(cells_of(shown, values), 31)
     board.lay(cells_of(shown, values), 31, -1)
     assert np.allclose(board.total, before)
+
+
+@pytest.mark.parametrize(
+    "evidence, summed, values",
+    [(ONE_VALUE, one_value, np.linspace(-2, 2, 9)), (FILLED_OR_EMPTY, lambda _, total: filled(total), [SHOWN, EMPTY])],
+    ids=["decoration", "outline"],
+)
+def test_what_a_shifted_map_gains_is_the_change_of_the_evidence(evidence, summed, values):
+    rng, rows, turns = np.random.default_rng(3), 5, 12
+    board = empty_board(evidence, (rows, turns))
+
+    def some(count):
+        row, column = np.divmod(rng.choice(rows * turns, count, replace=False), turns)
+        weights = rng.uniform(0.2, 1, count)
+        return cells_read(evidence, (rows, turns), row, column, rng.choice(values, count), weights), weights
+
+    for turn, count in enumerate((30, 20, 25)):
+        board.gains(some(4)[0])  # asked before it has changed
+        board.lay(some(count)[0], turn)
+    one, weights = some(22)
+    before = summed(board.count, board.total)
+    for turn, gain in enumerate(board.gains(one)):
+        at = one.row, (one.column + turn) % turns
+        more = summed(board.count[at] + 1, board.total[at] + one.values) - before[at]
+        assert np.isclose(gain, weights @ more, atol=1e-9)
 
 
 def test_a_turn_about_the_axis_leaves_the_axis(bottles):

@@ -13,9 +13,10 @@ import numpy as np
 
 from relit.fit.instances import View, best_seen, nearest_pixels
 from relit.fit.revolution import drawn, radius_at
-from relit.fit.turns import Cells, Told, best_laid, leads_of, turned_about
+from relit.fit.turns import Cells, Evidence, Told, best_laid, cells_read, leads_of, turned_about
 
 TURNS, RADII, HEIGHTS = 72, 9, 22  # cells around the body
+MAP = RADII * HEIGHTS, TURNS  # of fit/turns.py
 REACH, BEYOND = (0.1, 1.25), 0.1  # radii of the first and the last cells, and how far they go beyond the ends of the body (unit lengths)
 # shares of the window's side: next to the drawn body the outline is its own; next to the object background may be a pose that is not exact
 OUTLINE, VAGUE = 0.013, 0.02
@@ -29,9 +30,15 @@ CLEAR = (5.0, 0.04)  # and evidence by which that turn has to lead: so much, and
 FEWEST = 4  # views that are sure: of fewer, what an outline has beside the body can be chance
 
 
-def filled(count: np.ndarray, total: np.ndarray) -> np.ndarray:
+def filled(total: np.ndarray) -> np.ndarray:
     """Log evidence of the readings of a cell that is filled or empty, over that of an empty one; total: sum of SHOWN and EMPTY."""
     return np.log1p(FILLED * np.expm1(np.clip(total, -LARGEST, LARGEST)))
+
+
+FILLED_OR_EMPTY = Evidence(
+    lambda values: np.stack([values == SHOWN, values == EMPTY]).astype(np.float64),
+    lambda _, total: np.stack([filled(total + SHOWN), filled(total + EMPTY)]) - filled(total),
+)
 
 
 def cells_around(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,15 +64,15 @@ def cells_of(view: View, profile: np.ndarray, pose: np.ndarray) -> Cells:
     shown, empty = known & own & ~body[v, u], known & ~(near[v, u] & ok)
     index = np.flatnonzero(shown | empty)
     row, column = np.divmod(index, TURNS)
-    at = row * TURNS + (column + np.arange(TURNS)[:, None]) % TURNS
-    return Cells(at, np.where(shown[index], SHOWN, EMPTY), np.hypot(points[index, 0], points[index, 2]))
+    read = np.where(shown[index], SHOWN, EMPTY)
+    return cells_read(FILLED_OR_EMPTY, MAP, row, column, read, np.hypot(points[index, 0], points[index, 2]))
 
 
 def turned_by_outline(views: list[View], profile: np.ndarray, poses: np.ndarray) -> Told | None:
     """The turns of views whose axes are known (poses: (N, 4, 4)); None where fewer than FEWEST are sure of theirs."""
-    cells = [[cells_of(view, profile, pose)] for view, pose in zip(views, poses, strict=True)]
-    _, seats, turns = best_laid(cells, best_seen(views)[:AT_ONCE], filled)
-    show = np.array([(one.values > 0).sum() for (one,) in cells])
-    sure = (show >= SOME) & (leads_of(cells, seats, turns, filled, APART) >= np.maximum(CLEAR[0], CLEAR[1] * show))
+    read = [[cells_of(view, profile, pose)] for view, pose in zip(views, poses, strict=True)]
+    _, seats, turns = best_laid(read, best_seen(views)[:AT_ONCE], FILLED_OR_EMPTY, MAP)
+    show = np.array([(one.values > 0).sum() for (one,) in read])
+    sure = (show >= SOME) & (leads_of(read, seats, turns, FILLED_OR_EMPTY, MAP, APART) >= np.maximum(CLEAR[0], CLEAR[1] * show))
     turned = np.array([turned_about(pose, t * 2 * np.pi / TURNS) for pose, t in zip(poses, turns, strict=True)])
     return Told(turned, sure) if sure.sum() >= FEWEST else None

@@ -3,6 +3,9 @@
 What each shows is a map around the axis (fit/unrolled.py: paint; fit/beside.py: what sticks out). Two maps of one object then differ by a
 shift. All shifts are sought together, with the seats of each (fit/revolution_fit.py): a map is laid where it adds most to the evidence
 that its readings and those that lie there already are of one thing.
+
+What one more reading adds to the evidence of a cell is a sum of products, of what the reading is and of what lies there. So what a map adds
+under all shifts is a few circular correlations along the turn, which are products of Fourier transforms.
 """
 
 from __future__ import annotations
@@ -11,40 +14,63 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import irfft, rfft
 
 from relit.conventions import similarity
 
 SWEEPS = 4  # in which each is laid again
 
-Evidence = Callable[[np.ndarray, np.ndarray], np.ndarray]  # of a cell, from the number of its readings and their total
+
+@dataclass(frozen=True)
+class Evidence:
+    """That the readings of a cell are of one thing: a function E of their number n and their total.
+
+    features: values (C,) of readings -> (K, C). gains: number and total (...) in each cell -> (K, ...), such that the sum over K of
+    features(v) gains(n, total) is E(n + 1, total + v) - E(n, total)."""
+
+    features: Callable[[np.ndarray], np.ndarray]
+    gains: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Cells:
-    """What a view in a seat shows of the map. at: (T, C) flat indices of its cells for each of T shifts, evenly around. values, weights:
-    (C,), what was read there, and what it counts: a cell near the axis is small."""
+    """What a view in a seat shows of the map. row, column: (C,) of its cells, the columns evenly around the axis. values: (C,), what was
+    read there. spectrum: (K, R, F), the features of the readings times what they count, transformed along the turn."""
 
-    at: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
     values: np.ndarray
-    weights: np.ndarray
+    spectrum: np.ndarray
+
+
+def cells_read(evidence: Evidence, shape: tuple[int, int], row, column, values: np.ndarray, weights: np.ndarray) -> Cells:
+    """weights: (C,), what the readings count: a cell near the axis is small. shape: rows and columns of the map."""
+    features = np.zeros((len(evidence.features(values[:1])), *shape))
+    features[:, row, column] = evidence.features(values) * weights
+    return Cells(row, column, values, rfft(features))
 
 
 @dataclass
 class Board:
-    """What has been laid down: count and total of the readings in each cell (flat)."""
+    """What has been laid down: number and total of the readings in each cell, (R, T). spectrum: (K, R, F) of what further ones gain, None
+    where it is not known."""
 
     evidence: Evidence
     count: np.ndarray
     total: np.ndarray
+    spectrum: np.ndarray | None = None
 
     def lay(self, cells: Cells, turn: int, sign: int = 1) -> None:
-        np.add.at(self.count, cells.at[turn], sign)
-        np.add.at(self.total, cells.at[turn], sign * cells.values)
+        at = cells.row, (cells.column + turn) % self.count.shape[1]
+        self.count[at] += sign
+        self.total[at] += sign * cells.values
+        self.spectrum = None
 
     def gains(self, cells: Cells) -> np.ndarray:
         """(T,) of the evidence, for every shift."""
-        count, total, before = self.count[cells.at], self.total[cells.at], self.evidence(self.count, self.total)
-        return (self.evidence(count + 1, total + cells.values) - before[cells.at]) @ cells.weights
+        if self.spectrum is None:
+            self.spectrum = rfft(self.evidence.gains(self.count, self.total))
+        return irfft((cells.spectrum.conj() * self.spectrum).sum((0, 1)), self.count.shape[1])
 
     def best(self, seats: list[Cells]) -> tuple[float, int, int]:
         """Gain, seat and turn of a view's best place."""
@@ -60,15 +86,16 @@ class Told:
     sure: np.ndarray
 
 
-def empty_board(views: list[list[Cells]], evidence: Evidence) -> Board:
-    size = max(int(cells.at.max(initial=0)) for seats in views for cells in seats) + 1
-    return Board(evidence, np.zeros(size), np.zeros(size))
+def empty_board(evidence: Evidence, shape: tuple[int, int]) -> Board:
+    return Board(evidence, np.zeros(shape), np.zeros(shape))
 
 
-def laid(views: list[list[Cells]], first: int, group: list[int], evidence: Evidence) -> tuple[float, np.ndarray, np.ndarray]:
+def laid(
+    views: list[list[Cells]], first: int, group: list[int], evidence: Evidence, shape: tuple[int, int]
+) -> tuple[float, np.ndarray, np.ndarray]:
     """(evidence, seats (N,), turns (N,)): the view `first`, then those of the group, each time the one that gains most, then all others;
     and sweeps in which each is laid again."""
-    board, seat, turn = empty_board(views, evidence), np.zeros(len(views), int), np.zeros(len(views), int)
+    board, seat, turn = empty_board(evidence, shape), np.zeros(len(views), int), np.zeros(len(views), int)
     level = float(board.gains(views[first][0])[0])
     board.lay(views[first][0], 0)
 
@@ -102,15 +129,17 @@ def laid(views: list[list[Cells]], first: int, group: list[int], evidence: Evide
     return level, seat, turn
 
 
-def best_laid(views: list[list[Cells]], group: list[int], evidence: Evidence) -> tuple[float, np.ndarray, np.ndarray]:
-    """(evidence, seats (N,), turns (N,)) of `laid` from the best first one of the group."""
-    return max((laid(views, k, group, evidence) for k in group), key=lambda one: one[0])
+def best_laid(
+    views: list[list[Cells]], group: list[int], evidence: Evidence, shape: tuple[int, int]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """(evidence, seats (N,), turns (N,)) of `laid` from the best first one of the group. shape: rows and columns of the map."""
+    return max((laid(views, k, group, evidence, shape) for k in group), key=lambda one: one[0])
 
 
-def leads_of(views: list[list[Cells]], seat: np.ndarray, turn: np.ndarray, evidence: Evidence, apart: float) -> np.ndarray:
+def leads_of(views: list[list[Cells]], seat: np.ndarray, turn: np.ndarray, evidence: Evidence, shape, apart: float) -> np.ndarray:
     """(N,) by how much the evidence of each view, all others laid, is larger than in any other seat, or turned by `apart` degrees or
     more."""
-    board, out = empty_board(views, evidence), []
+    board, out = empty_board(evidence, shape), []
     for cells, i, t in zip(views, seat, turn, strict=True):
         board.lay(cells[i], t)
     for cells, i, t in zip(views, seat, turn, strict=True):

@@ -17,7 +17,7 @@ import numpy as np
 
 from relit.fit.instances import View
 from relit.fit.revolution import radius_at
-from relit.fit.turns import Cells, Told, best_laid, leads_of, turned_about
+from relit.fit.turns import Cells, Evidence, Told, best_laid, cells_read, leads_of, turned_about
 from relit.scene import Camera
 
 TURNS, LATITUDES = 120, 48  # cells of a map
@@ -157,12 +157,13 @@ def maps_of(views: list[View], profile: np.ndarray, seats: list[list[np.ndarray]
 
 
 def cells_of(shown: np.ndarray, values: np.ndarray) -> Cells:
-    """values: (C, LATITUDES, TURNS) of the channels that are asked."""
+    """values: (C, LATITUDES, TURNS) of the channels that are asked, which lie below one another."""
     row, column = np.nonzero(shown)
-    at = row * TURNS + (column + np.arange(TURNS)[:, None]) % TURNS
-    each = [at + c * LATITUDES * TURNS for c in range(len(values))]
     weight = np.cos((row + 0.5) / LATITUDES * np.pi - np.pi / 2)
-    return Cells(np.concatenate(each, 1), values[:, row, column].ravel().astype(np.float64), np.tile(weight, len(values)))
+    count = len(values)
+    rows = np.concatenate([row + c * LATITUDES for c in range(count)])
+    read = values[:, row, column].ravel().astype(np.float64)
+    return cells_read(ONE_VALUE, (count * LATITUDES, TURNS), rows, np.tile(column, count), read, np.tile(weight, count))
 
 
 def one_value(count: np.ndarray, total: np.ndarray) -> np.ndarray:
@@ -170,14 +171,23 @@ def one_value(count: np.ndarray, total: np.ndarray) -> np.ndarray:
     return 2 * total**2 / (1 + count) - np.log1p(count)
 
 
+def gains_of_one_value(count: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """(3, ...) what 1, v and the square of v are multiplied by, of a further reading v."""
+    return np.stack([one_value(count + 1, total) - one_value(count, total), 4 * total / (2 + count), 2 / (2 + count)])
+
+
+ONE_VALUE = Evidence(lambda v: np.stack([np.ones_like(v), v, v**2]), gains_of_one_value)
+
+
 def turned_by_decoration(views: list[View], profile: np.ndarray, seats: list[list[np.ndarray]]) -> dict[str, Told]:
     """The seat and the turn about the axis of each view, as each of CHANNELS tells it, and all together."""
     maps, out = maps_of(views, profile, seats), {}
     group = sorted(range(len(views)), key=lambda k: -maps[k][0][0].sum())[:AT_ONCE]
     for channel, use in (*((name, [c]) for c, name in enumerate(CHANNELS)), ("colour and brightness", [0, 1, 2])):
-        cells = [[cells_of(shown, values[use]) for shown, values in one] for one in maps]
-        _, chosen, turns = best_laid(cells, group, one_value)
+        shape = len(use) * LATITUDES, TURNS
+        read = [[cells_of(shown, values[use]) for shown, values in one] for one in maps]
+        _, chosen, turns = best_laid(read, group, ONE_VALUE, shape)
         poses = np.array([turned_about(some[i], t * 2 * np.pi / TURNS) for some, i, t in zip(seats, chosen, turns, strict=True)])
-        size = [max(len(some[i].values), 1) for some, i in zip(cells, chosen, strict=True)]
-        out[channel] = Told(poses, leads_of(cells, chosen, turns, one_value, APART) >= CLEAR * np.array(size))
+        size = [max(len(some[i].values), 1) for some, i in zip(read, chosen, strict=True)]
+        out[channel] = Told(poses, leads_of(read, chosen, turns, ONE_VALUE, shape, APART) >= CLEAR * np.array(size))
     return out
