@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
-from relit.fit import instance_search
+from relit.fit import instance_revolution, instance_search
 from relit.fit.beside import EMPTY, FILLED_OR_EMPTY, SHOWN, filled, turned_by_outline
 from relit.fit.instance_options import Search
-from relit.fit.instance_revolution import EXACT, flat, place_revolved
+from relit.fit.instance_revolution import EXACT, LONGER, flat, place_revolved
 from relit.fit.instances import View, crops_of
 from relit.fit.register import crop_rings
 from relit.fit.revolution import KNOTS, OUTLINE, axis_of, drawn, leaning_back
@@ -181,6 +181,29 @@ def test_a_turn_about_the_axis_leaves_the_axis(bottles):
     pose = bottles[3].poses[0]
     turned = turned_about(pose, 0.7)
     assert np.allclose(axis_of(turned), axis_of(pose)) and np.isclose(rotation_angle(turned[:3, :3] @ pose[:3, :3].T), np.degrees(0.7))
+
+
+@pytest.mark.parametrize(
+    "short, long, told, asked",
+    [({"a": 0.75, "b": 0.74, "c": 0.6}, {"a": 0.7, "b": 0.76}, "b", 5), ({"a": 0.75, "b": 0.6, "c": 0.5}, {}, "a", 3)],
+    ids=["close", "clear"],
+)
+def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, long, told, asked):
+    fits = []
+
+    def agreement(views, crops, poses, o, seed, steps):
+        fits.append(steps)
+        return (short if steps == o.steps else long)[poses]
+
+    monkeypatch.setattr(instance_revolution, "decoration_agreement", agreement)
+    assert instance_revolution.likeliest(None, None, {name: name for name in short}, OPTIONS, 0) == told
+    assert len(fits) == asked and max(fits) == (LONGER if long else 1) * OPTIONS.steps
+
+
+def test_without_an_answer_that_agrees_none_is_likeliest(monkeypatch):
+    monkeypatch.setattr(instance_revolution, "decoration_agreement", lambda *a: -np.inf)
+    assert instance_revolution.likeliest(None, None, {"a": None, "b": None}, OPTIONS, 0) is None
+    assert instance_revolution.likeliest(None, None, {}, OPTIONS, 0) is None
 
 
 def placed(bottles, told, monkeypatch, sure):

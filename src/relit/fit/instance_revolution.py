@@ -25,6 +25,7 @@ FEWEST = 4  # objects: of fewer, silhouettes that something else has can be thos
 LIKELY = 0.96  # score of the best silhouette, revolved, against all others, below which nothing is fitted
 FIRST, NEARLY, EXACT = 0.006, 0.004, 0.001  # misfit (`Revolved.misfit`) of a first fit, of a body with a handle, and of one without
 OPEN = 5  # seats of the median object, from which on the silhouettes do not tell the axis: those of a ball
+LONGER, CLOSE = 3, 0.05  # times the steps of a first fit that decide between answers whose agreements lie so near to the best one
 DECORATION = (0.0, 2.0, 0.0, 1.0)  # weights of fit.register's descriptor: silhouettes agree in every turn
 LAID, FLAT = 6, 0.4  # objects from which on a plane tells, and how far from it (root mean square, unit lengths) their middles may lie
 
@@ -56,10 +57,9 @@ def place_revolved(views: list[View], crops: list[Crop], o: Search, *, seed: int
     beside = turned_by_outline(views, body.profile, np.array([some[0] for some in seats]))
     if beside is not None:
         answers["what sticks out"] = beside
-    levels = {name: decoration_agreement(views, crops, answer.poses, o, seed) for name, answer in answers.items()}
-    if max(levels.values(), default=-np.inf) == -np.inf:
+    told = likeliest(views, crops, {name: answer.poses for name, answer in answers.items()}, o, seed)
+    if told is None:
         return None
-    told = max(levels, key=levels.get)
     poses, sure = answers[told].poses, answers[told].sure
     say(f"bodies of revolution: one profile fits the outlines (misfit {body.misfit:.5f} of a silhouette's area)")
     say(f"turned about their axes by {told}: {sure.sum()} of {len(views)} are sure")
@@ -78,12 +78,25 @@ def flat(poses: np.ndarray) -> bool:
     return len(poses) >= LAID and np.linalg.svd(middles - middles.mean(0))[1][2] <= FLAT * np.sqrt(len(poses))
 
 
-def decoration_agreement(views, crops, poses: np.ndarray, o: Search, seed: int) -> float:
-    """Median score of all against a model of all, without silhouettes; -inf where these have nothing in common."""
+def likeliest(views, crops, answers: dict[str, np.ndarray], o: Search, seed: int) -> str | None:
+    """Which of several sets of poses (N, 4, 4) agrees best with a model of all of it; None where none does at all. Where others come close,
+    longer fits decide: wrong turns make the model of all better for a while as well."""
+    levels = {name: decoration_agreement(views, crops, poses, o, seed, o.steps) for name, poses in answers.items()}
+    best = max(levels.values(), default=-np.inf)
+    if best == -np.inf:
+        return None
+    close = [name for name, level in levels.items() if level >= best - CLOSE]
+    if len(close) > 1:
+        levels = {name: decoration_agreement(views, crops, answers[name], o, seed, LONGER * o.steps) for name in close}
+    return max(levels, key=levels.get)
+
+
+def decoration_agreement(views, crops, poses: np.ndarray, o: Search, seed: int, steps: int) -> float:
+    """Median score of all against a model of all, without silhouettes; -inf where these have nothing in common. steps: half of the fit."""
     try:
         values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
     except NoShape:
         return -np.inf
-    model, poses = fit_model(views, poses, values, 2 * o.steps, refine_cameras=o.rate, hold=o.steps // 2, seed=seed)
+    model, poses = fit_model(views, poses, values, 2 * steps, refine_cameras=o.rate, hold=o.steps // 2, seed=seed)
     scores = refine(crops, poses, albedo_render(model), rings=crop_rings(crops, DECORATION), steps=(0, 2.0), parts=DECORATION)[1]
     return float(np.median(scores))
