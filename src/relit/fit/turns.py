@@ -136,7 +136,9 @@ def best_laid(
     return max((laid(views, k, group, evidence, shape) for k in group), key=lambda one: one[0])
 
 
-def leads_of(views: list[list[Cells]], seat: np.ndarray, turn: np.ndarray, evidence: Evidence, shape, apart: float) -> np.ndarray:
+def leads_of(
+    views: list[list[Cells]], seat: np.ndarray, turn: np.ndarray, evidence: Evidence, shape: tuple[int, int], apart: float
+) -> np.ndarray:
     """(N,) by how much the evidence of each view, all others laid, is larger than in any other seat, or turned by `apart` degrees or
     more."""
     board, out = empty_board(evidence, shape), []
