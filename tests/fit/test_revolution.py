@@ -193,11 +193,11 @@ def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, 
 
     def agreement(views, crops, poses, o, seed, steps):
         fits.append(steps)
-        return (short if steps == o.steps else long)[poses]
+        return (short if steps == 2 * o.steps else long)[poses]
 
     monkeypatch.setattr(instance_revolution, "decoration_agreement", agreement)
     assert instance_revolution.likeliest(None, None, {name: name for name in short}, OPTIONS, 0) == told
-    assert len(fits) == asked and max(fits) == (LONGER if long else 1) * OPTIONS.steps
+    assert len(fits) == asked and max(fits) == (LONGER if long else 1) * 2 * OPTIONS.steps
 
 
 def test_without_an_answer_that_agrees_none_is_likeliest(monkeypatch):

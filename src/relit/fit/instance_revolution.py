@@ -81,22 +81,22 @@ def flat(poses: np.ndarray) -> bool:
 def likeliest(views, crops, answers: dict[str, np.ndarray], o: Search, seed: int) -> str | None:
     """Which of several sets of poses (N, 4, 4) agrees best with a model of all of it; None where none does at all. Where others come close,
     longer fits decide: wrong turns make the model of all better for a while as well."""
-    levels = {name: decoration_agreement(views, crops, poses, o, seed, o.steps) for name, poses in answers.items()}
+    levels = {name: decoration_agreement(views, crops, poses, o, seed, 2 * o.steps) for name, poses in answers.items()}
     best = max(levels.values(), default=-np.inf)
     if best == -np.inf:
         return None
     close = [name for name, level in levels.items() if level >= best - CLOSE]
     if len(close) > 1:
-        levels = {name: decoration_agreement(views, crops, answers[name], o, seed, LONGER * o.steps) for name in close}
+        levels = {name: decoration_agreement(views, crops, answers[name], o, seed, LONGER * 2 * o.steps) for name in close}
     return max(levels, key=levels.get)
 
 
 def decoration_agreement(views, crops, poses: np.ndarray, o: Search, seed: int, steps: int) -> float:
-    """Median score of all against a model of all, without silhouettes; -inf where these have nothing in common. steps: half of the fit."""
+    """Median score of all against a model of all, without silhouettes; -inf where these have nothing in common. steps: of the fit."""
     try:
         values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
     except NoShape:
         return -np.inf
-    model, poses = fit_model(views, poses, values, 2 * steps, refine_cameras=o.rate, hold=o.steps // 2, seed=seed)
+    model, poses = fit_model(views, poses, values, steps, refine_cameras=o.rate, hold=o.steps // 2, seed=seed)
     scores = refine(crops, poses, albedo_render(model), rings=crop_rings(crops, DECORATION), steps=(0, 2.0), parts=DECORATION)[1]
     return float(np.median(scores))

@@ -45,8 +45,9 @@ class Cells:
 
 def cells_read(evidence: Evidence, shape: tuple[int, int], row, column, values: np.ndarray, weights: np.ndarray) -> Cells:
     """weights: (C,), what the readings count: a cell near the axis is small. shape: rows and columns of the map."""
-    features = np.zeros((len(evidence.features(values[:1])), *shape))
-    features[:, row, column] = evidence.features(values) * weights
+    told = evidence.features(values) * weights
+    features = np.zeros((len(told), *shape))
+    features[:, row, column] = told
     return Cells(row, column, values, rfft(features))
 
 
