@@ -155,3 +155,30 @@ def test_the_command_is_the_one_a_user_would_give(tmp_path):
     assert command[:4] == [sys.executable, "-m", "relit", "reconstruct"]
     assert command[-3:] == ["--set", "a=1", "--masks=none"] and "draft" in command
     assert command[command.index("--capture") + 1] == "multiview"
+
+
+def test_a_run_that_fails_is_told_and_the_others_go_on(tiny, monkeypatch, capsys):
+    """As `search` of the duplicates does, without which nothing is left to show: a result of the ablation, not the end of the suite."""
+    folder, data = tiny
+    broken = {"max_depth=3"}
+
+    def stand_in(capture, out, kind, quality, device, seed, words=()):
+        if broken & {*words} or "all" in broken:
+            return [sys.executable, "-c", "print('no pair is linked'); raise SystemExit(4)"]
+        return [sys.executable, "-c", f"import shutil; shutil.copytree({str(folder / 'ready')!r}, {str(out)!r})"]
+
+    monkeypatch.setattr(runner, "reconstruct_command", stand_in)
+    options = dict(assets=data, cache=folder / "cache", device="cpu", spp=16)
+    result = run_suite("tiny", out=folder / "out", ablate=["max_depth=3", "shallow"], **options)
+    assert "no pair is linked" in result["failed"]["max_depth=3"]["ball"] and result["means"]["max_depth=3"] == {}
+    assert result["means"]["shallow"]["relit_psnr"] > 25 and result["failed"]["plain"] == {}
+    text = (folder / "out" / "results.md").read_text()
+    assert text.count("| relit_psnr |") == 2 and "`ball` failed:" in text and "no pair is linked" in text
+    said = capsys.readouterr().out
+    assert "ball (max_depth=3): failed: the command ended with code 4" in said and " - │" in said
+
+    broken.add("all")
+    with pytest.raises(UserError, match="1 of 1 runs failed") as error:
+        run_suite("tiny", out=folder / "again", **options)
+    assert error.value.code == EXIT_FAILED and "no pair is linked" in error.value.why
+    assert json.loads((folder / "again" / "results.json").read_text())["failed"]["plain"]["ball"]

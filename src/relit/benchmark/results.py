@@ -11,6 +11,8 @@ from relit.benchmark.suites import Bar, Suite
 
 def means(runs: dict[str, dict]) -> dict[str, float]:
     """Mean over objects of every figure that all of them have."""
+    if not runs:
+        return {}
     first, *rest = [r["metrics"] for r in runs.values()]
     names = [k for k in first if all(k in r for r in rest)]
     return {k: float(np.mean([first[k]["value"], *(r[k]["value"] for r in rest)])) for k in names}
@@ -29,31 +31,42 @@ def bar_text(bar: Bar | None) -> str:
 
 
 def markdown(result: dict[str, Any], suite: Suite) -> str:
-    """A fragment for benchmarks/RESULTS.md: per variant one table with the objects, the mean, and the bar."""
+    """A fragment for benchmarks/RESULTS.md: per variant one table with the objects, the mean, and the bar; then what failed, and why."""
     lines = [f"Suite `{result['suite']}`, quality `{result['quality']}`, device `{result['device']}`, {result['machine']}.", ""]
     for variant, runs in result["runs"].items():
-        lines += [f"### {variant}", "", f"| figure | unit | {' | '.join(runs)} | mean | bar | |", "|---" * (len(runs) + 5) + "|"]
-        for figure, mean in result["means"][variant].items():
+        lines += [f"### {variant}", ""]
+        if runs:
+            lines += [f"| figure | unit | {' | '.join(runs)} | mean | bar | |", "|---" * (len(runs) + 5) + "|"]
+        for figure in means(runs):
             values = " | ".join(f"{r['metrics'][figure]['value']:.4g}" for r in runs.values())
             bar, unit = suite.bar(figure, result["quality"]), next(iter(runs.values()))["metrics"][figure]["unit"]
-            lines.append(f"| {figure} | {unit} | {values} | {mean:.4g} | {bar_text(bar)} | {verdict(bar, mean)} |")
-        lines.append("")
+            mean = result["means"][variant].get(figure)
+            told = ("", "") if mean is None else (f"{mean:.4g}", verdict(bar, mean))
+            lines.append(f"| {figure} | {unit} | {values} | {told[0]} | {bar_text(bar)} | {told[1]} |")
+        lines += [*([""] if runs else []), *_failures(result["failed"][variant])]
     return "\n".join(lines)
 
 
 def table(result: dict[str, Any], suite: Suite):
-    """A rich Table of the means: one column a variant, one row a figure."""
+    """A rich Table of the means: one column a variant, one row a figure. A variant of which an object failed is a column of dashes."""
     from rich.table import Table
 
-    out = Table(title=f"{result['suite']}, {result['quality']}, mean of {len(next(iter(result['runs'].values())))} objects")
+    objects = {*result["runs"]["plain"], *result["failed"]["plain"]}
+    out = Table(title=f"{result['suite']}, {result['quality']}, mean of {len(objects)} objects")
     out.add_column("figure")
     for variant in result["means"]:
         out.add_column(variant, justify="right")
     out.add_column("bar", justify="right")
     out.add_column("")
-    first = next(iter(result["means"].values()))
-    for figure, value in first.items():
-        bar = suite.bar(figure, result["quality"])
-        row = [f"{v[figure]:.4g}" if figure in v else "" for v in result["means"].values()]
-        out.add_row(figure, *row, bar_text(bar), verdict(bar, value))
+    for figure in dict.fromkeys(f for m in result["means"].values() for f in m):
+        bar, value = suite.bar(figure, result["quality"]), result["means"]["plain"].get(figure)
+        row = [f"{m[figure]:.4g}" if figure in m else "" if m else "-" for m in result["means"].values()]
+        out.add_row(figure, *row, bar_text(bar), "" if value is None else verdict(bar, value))
     return out
+
+
+def _failures(failed: dict[str, str]) -> list[str]:
+    lines = []
+    for name, reason in failed.items():
+        lines += [f"`{name}` failed:", "", "```", reason, "```", ""]
+    return lines

@@ -13,7 +13,7 @@ from typing import Any
 from relit.benchmark.cost import COST_DEFINITIONS, machine, timed
 from relit.benchmark.results import markdown, means, table
 from relit.benchmark.suites import SUITES, Item, Suite, named
-from relit.errors import UserError, did_you_mean
+from relit.errors import EXIT_FAILED, UserError, did_you_mean
 from relit.evaluate.results import entries
 from relit.files import write_text
 
@@ -38,7 +38,9 @@ def run_suite(
     assets: folder with `assets` and `envmaps`. objects: names to limit the suite to. ablate: names of the suite's ablations or `key=value`.
     out: folder for the runs and the results, by default a new one in the cache. spp: samples a pixel of the compared
     pictures, by default as many as `relit evaluate` takes.
-    Returns {"suite", "quality", "device", "machine", "runs": {variant: {object: {"metrics", ...}}}, "means": {variant: {figure: value}}}.
+    Returns {"suite", "quality", "device", "machine", "runs": {variant: {object: {"metrics", ...}}}, "failed": {variant: {object: reason}},
+    "means": {variant: {figure: value}}}. What fails is told and the others go on; a variant of which an object failed has no means.
+    Raises UserError (exit code 4) in the end if a plain run failed; an ablated one may, as that is its result.
     """
     from relit.device import use_device
 
@@ -57,28 +59,37 @@ def run_suite(
         "seed": seed,
         "machine": machine(),
         "runs": {},
+        "failed": {},
         "means": {},
     }
     for variant, words in variants.items():
-        result["runs"][variant] = {}
+        result["runs"][variant], result["failed"][variant] = {}, {}
         for name, capture in captures.items():
             run = folder / f"{name}-{variant.replace('=', '_').replace('/', '_')}"
             if run.exists():
                 raise UserError("a run of that name is there already", "a resumed run cannot be timed", f"choose another folder: {run}")
             command = reconstruct_command(capture, run, spec.kind, quality, used, seed, (*spec.flags, *words))
             say(f"{name} ({variant}): {' '.join(command[1:])}")
-            seconds, memory = timed(command, folder / "logs" / f"{run.name}.txt")
-            say(f"{name} ({variant}): {seconds:.0f} s, {memory:.2f} GB; evaluating")
-            entry = evaluate(run, capture, **samples)
-            costs = entries({"seconds": seconds, "peak_memory": memory}, COST_DEFINITIONS)
-            entry["metrics"] = {**costs, **entry["metrics"]}
-            result["runs"][variant][name] = {**entry, "run": run.name, "capture": capture.name}
-            result["means"][variant] = means(result["runs"][variant])
+            try:
+                seconds, memory = timed(command, folder / "logs" / f"{run.name}.txt")
+                say(f"{name} ({variant}): {seconds:.0f} s, {memory:.2f} GB; evaluating")
+                entry = evaluate(run, capture, **samples)
+            except UserError as error:
+                say(f"{name} ({variant}): failed: {error}")
+                result["failed"][variant][name] = str(error)
+            else:
+                costs = entries({"seconds": seconds, "peak_memory": memory}, COST_DEFINITIONS)
+                entry["metrics"] = {**costs, **entry["metrics"]}
+                result["runs"][variant][name] = {**entry, "run": run.name, "capture": capture.name}
+            result["means"][variant] = {} if result["failed"][variant] else means(result["runs"][variant])
             _save(result, spec, folder, json_file)
     from rich.console import Console
 
     Console(width=None if sys.stdout.isatty() else 160).print(table(result, spec))
     say(f"results: {folder / 'results.json'}, {folder / 'results.md'}")
+    if failed := result["failed"]["plain"]:
+        reasons = "\n".join(f"{name}: {reason}" for name, reason in failed.items())
+        raise UserError(f"{len(failed)} of {len(items)} runs failed", reasons, f"what did not: {folder / 'results.md'}", code=EXIT_FAILED)
     return result
 
 
