@@ -31,6 +31,7 @@ HALVINGS = 2  # how often half the way to the next turn is tried on both sides
 SCENES = TURNS + 2 * HALVINGS * PLACES  # that are rendered
 SIDE, SAMPLES = 128, 8  # pixels of the pictures that are compared, longer side; rays a pixel of each of two pictures
 SOLID = 0.98  # of a pixel that must be the instance's
+AROUND = 8  # pixels beside those that are rendered: a picture is laid on its photo from a pixel or two away
 
 
 def turned_as_shown(
@@ -100,8 +101,8 @@ def difference(scene: Scene, camera: Camera, photo: np.ndarray, solid: np.ndarra
     product of what two pictures with samples of their own differ: the square of one would prefer what has less noise."""
     if not solid.any():
         return 0.0
-    small = camera.within(SIDE)
-    pictures = [srgb_from_linear(np.clip(render(scene, small, spp=SAMPLES, seed=2 * seed + k)[..., :3], 0, 1)) for k in (0, 1)]
+    small, where = camera.within(SIDE), cv2.dilate(solid.astype(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0
+    pictures = [srgb_from_linear(np.clip(render(scene, small, spp=SAMPLES, seed=2 * seed + k, where=where)[..., :3], 0, 1)) for k in (0, 1)]
     at = laid_on(sum(pictures) / 2, photo, solid)
     one, other = ((moved_by(p, at) - photo)[solid] for p in pictures)
     return float((one * other).mean())

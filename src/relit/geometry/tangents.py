@@ -13,6 +13,19 @@ def _unit(x):
     return np.where(length > 1e-20, x / np.maximum(length, 1e-20), np.array([0.0, 0.0, 1.0]))
 
 
+def _corner_angles(corners):
+    """Three (F, 1): the angles of faces (F, 3, 3) at their first, second and third corners."""
+    sides = [_unit(corners[:, (k + 1) % 3] - corners[:, k]) for k in range(3)]  # from each corner to the next one
+    return [np.arccos(np.clip(-(sides[k] * sides[k - 1]).sum(-1, keepdims=True), -1, 1)) for k in range(3)]
+
+
+def _sums(faces, shares, count):
+    """(count, 3) what the corners of all faces (F, 3) add up to at their vertices. shares: three (F, 3), of the faces' first, second and
+    third corners."""
+    index, values = np.asarray(faces).T.ravel(), np.concatenate(shares)
+    return np.stack([np.bincount(index, values[:, k], count) for k in range(3)], -1)
+
+
 def edges(faces: np.ndarray) -> np.ndarray:
     """(3 F, 2) vertices of the sides of all faces: first sides 0-1 of all, then sides 1-2, then sides 2-0."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -27,11 +40,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     ident = ident.reshape(-1)
     corners = v[f]  # [F, 3, 3]
     face = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    total = np.zeros((ident.max(initial=-1) + 1, 3))
-    for k in range(3):
-        a, b = _unit(corners[:, (k + 1) % 3] - corners[:, k]), _unit(corners[:, (k + 2) % 3] - corners[:, k])
-        angle = np.arccos(np.clip((a * b).sum(-1), -1, 1))
-        np.add.at(total, ident[f[:, k]], face * angle[:, None])
+    total = _sums(ident[f], [face * a for a in _corner_angles(corners)], ident.max(initial=-1) + 1)
     return _unit(total)[ident].astype(np.float32)
 
 
@@ -52,12 +61,8 @@ def vertex_tangents(mesh: Mesh) -> np.ndarray:
     dp_dv = (e2 * d1[:, :1] - e1 * d2[:, :1]) * sign
     length_u, length_v = np.linalg.norm(dp_du, axis=-1, keepdims=True), np.linalg.norm(dp_dv, axis=-1, keepdims=True)
     dp_du, dp_dv = dp_du / np.maximum(length_u, 1e-30), dp_dv / np.maximum(length_v, 1e-30)
-    along_u, along_v = np.zeros_like(v), np.zeros_like(v)
-    for k in range(3):
-        a, b = _unit(corners[:, (k + 1) % 3] - corners[:, k]), _unit(corners[:, (k + 2) % 3] - corners[:, k])
-        angle = np.arccos(np.clip((a * b).sum(-1), -1, 1))[:, None]
-        np.add.at(along_u, f[:, k], dp_du * angle)
-        np.add.at(along_v, f[:, k], dp_dv * angle)
+    angles = _corner_angles(corners)
+    along_u, along_v = (_sums(f, [along * a for a in angles], len(v)) for along in (dp_du, dp_dv))
     t = along_u - n * (n * along_u).sum(-1, keepdims=True)
     lost = np.linalg.norm(t, axis=-1) < 1e-8
     axis = np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
