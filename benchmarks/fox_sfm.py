@@ -2,8 +2,8 @@
 
     python benchmarks/fox_sfm.py [folder of multiview_fox]
 
-Prints how many photos were registered, the rotation errors in degrees and the centre errors in percent of the cameras' spread,
-both after the best similarity, and the seconds it took.
+Prints how many photos were registered, the rotation errors in degrees and the centre errors in
+percent of the cameras' spread, both after the best similarity, and the seconds it took.
 """
 
 from __future__ import annotations
@@ -15,18 +15,25 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.cameras.se3 import camera_errors
 from relit.cameras.sfm import find_cameras
-from relit.capture import open_capture
+from relit.capture.open import open_capture
+from relit.geometry.se3 import camera_errors
 
 
 def fox_folder() -> Path:
-    """multiview_fox in the folder that RELIT_DATA names, or in shared/data beside the repository or in it."""
+    """multiview_fox in the folder that RELIT_DATA names, or in shared/data beside the repository or
+    in it."""
     here = Path(__file__).resolve().parents[1]
-    places = [os.environ.get("RELIT_DATA"), here / "shared" / "data", here.parent / "shared" / "data"]
+    places = [
+        os.environ.get("RELIT_DATA"),
+        here / "shared" / "data",
+        here.parent / "shared" / "data",
+    ]
     found = next((Path(p) for p in places if p and Path(p).is_dir()), None)
     if found is None:
-        raise SystemExit("the fox photos are not there: set RELIT_DATA to the folder of the third-party data")
+        raise SystemExit(
+            "the fox photos are not there: set RELIT_DATA to the folder of the third-party data"
+        )
     return found / "real" / "multiview_fox"
 
 
@@ -34,7 +41,9 @@ def fox_sfm(folder: Path, seed: int = 0) -> dict[str, float]:
     """Run and compare; the figures by name."""
     truth = {Path(p.name).name: p.camera for p in open_capture(folder).photos}
     with tempfile.TemporaryDirectory() as work:
-        found, verdict = find_cameras(open_capture(folder / "images"), seed=seed, workdir=Path(work))
+        found, verdict = find_cameras(
+            open_capture(folder / "images"), seed=seed, workdir=Path(work)
+        )
     names = [p.name for p in found.photos]
     poses = np.stack([p.camera.world_from_camera for p in found.photos])
     given = np.stack([truth[n].world_from_camera for n in names])

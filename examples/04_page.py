@@ -1,4 +1,7 @@
-"""One HTML file to send to somebody who has neither Python nor Blender: python examples/04_page.py RUN FILE.html"""
+"""One HTML file to send to somebody without Python or Blender:
+
+    python examples/04_page.py RUN FILE.html
+"""
 
 import sys
 

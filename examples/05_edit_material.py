@@ -12,6 +12,10 @@ import relit
 from relit.asset.gltf import write_glb
 
 asset = relit.load(sys.argv[1]).asset
-glossy = replace(asset.material, roughness=np.minimum(asset.material.roughness, 0.25), base_color=asset.material.base_color**1.2)
+glossy = replace(
+    asset.material,
+    roughness=np.minimum(asset.material.roughness, 0.25),
+    base_color=asset.material.base_color**1.2,
+)
 write_glb(sys.argv[2], asset.mesh, glossy)
 print(sys.argv[2])

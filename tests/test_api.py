@@ -12,11 +12,11 @@ from test_faults import write_capture
 
 import relit
 from relit.asset.asset import save_asset
-from relit.cameras.se3 import look_at
-from relit.capture.procedural import pawn, studio
 from relit.errors import UserError
+from relit.geometry.se3 import look_at
 from relit.images import write_linear
 from relit.scene import Asset, Camera
+from relit.synthesize.procedural import pawn, studio
 from relit.viewer.page import PAGE
 
 TINY = {"levels": [16], "level_steps": [12], "rays": 128, "faces": 300, "texture": 16, "light": 4}
@@ -37,19 +37,24 @@ def test_from_photos_to_an_asset(tmp_path):
     capture = relit.open_capture(folder)
     assert len(capture.photos) == 6 and capture.has_cameras
     assert relit.inspect(folder)["photos"] == 6
-    asset = relit.reconstruct(folder, tmp_path / "run", quality="draft", device="cpu", settings=TINY, report=False)
+    asset = relit.reconstruct(
+        folder, tmp_path / "run", quality="draft", device="cpu", settings=TINY, report=False
+    )
     assert isinstance(asset, relit.AssetFolder) and asset.folder == tmp_path / "run/asset"
     assert len(asset.asset.mesh.faces) > 50 and len(asset.asset.cameras) == 6
-    from relit.reconstruct import reconstruct  # the module of that name is still one
-
-    assert reconstruct.__module__ == "relit.reconstruct" and callable(relit.reconstruct)
 
 
 def test_relight_and_export(asset, tmp_path):
     write_linear(tmp_path / "light.hdr", studio(8))
     (picture,) = asset.relight(tmp_path / "light.hdr", size=24, spp=2, device="cpu")
-    assert isinstance(picture, Image.Image) and picture.size == (24, 24) and np.asarray(picture).max() > 30
-    files = asset.relight(tmp_path / "light.hdr", tmp_path / "out", cameras="capture", size=16, spp=1, device="cpu")
+    assert (
+        isinstance(picture, Image.Image)
+        and picture.size == (24, 24)
+        and np.asarray(picture).max() > 30
+    )
+    files = asset.relight(
+        tmp_path / "light.hdr", tmp_path / "out", cameras="capture", size=16, spp=1, device="cpu"
+    )
     assert [f.suffix for f in files] == [".png"] and files[0].is_file()
     for name in ("a.glb", "a.obj", "a.ply"):
         assert asset.export(tmp_path / name).is_file()
@@ -60,7 +65,12 @@ def test_relight_and_export(asset, tmp_path):
 def test_what_a_notebook_shows(asset, monkeypatch):
     if PAGE.is_file():
         shown = asset._repr_html_()
-        assert shown.startswith("<iframe") and 'sandbox="allow-scripts"' in shown and shown.count('"') == 6 and "model/gltf-binary" in shown
+        assert (
+            shown.startswith("<iframe")
+            and 'sandbox="allow-scripts"' in shown
+            and shown.count('"') == 6
+            and "model/gltf-binary" in shown
+        )
     monkeypatch.setattr("relit.viewer.page.PAGE", PAGE.with_name("nowhere.html"))
     assert "&lt;b&gt;" in asset._repr_html_() and "make viewer" in asset._repr_html_()
 
@@ -75,4 +85,9 @@ def test_folders_that_hold_no_asset(tmp_path):
 def test_import_is_quick_and_light():
     job = "import sys, relit; dir(relit); print({'mitsuba', 'numpy', 'cv2'} & set(sys.modules)); "
     job += "relit.open_capture; assert 'mitsuba' not in sys.modules"
-    assert subprocess.run([sys.executable, "-c", job], capture_output=True, text=True, check=True).stdout == "set()\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", job], capture_output=True, text=True, check=True
+        ).stdout
+        == "set()\n"
+    )

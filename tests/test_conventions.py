@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relit import conventions as c
-from relit.cameras.se3 import exp_so3
+from relit.geometry.se3 import exp_so3
 
 RNG = np.random.default_rng(0)
 unit_interval = st.floats(0.0, 1.0)
@@ -28,7 +28,9 @@ def test_srgb_values_of_the_standard():
 
 
 def test_luminance_of_white_and_of_green():
-    np.testing.assert_allclose(c.luminance(np.eye(3, dtype=np.float32)), [0.2126, 0.7152, 0.0722], rtol=1e-6)
+    np.testing.assert_allclose(
+        c.luminance(np.eye(3, dtype=np.float32)), [0.2126, 0.7152, 0.0722], rtol=1e-6
+    )
     assert float(c.luminance(np.ones(3, np.float32))) == pytest.approx(1.0)
 
 
@@ -68,8 +70,11 @@ def test_similarities_move_points_and_poses_alike():
     np.testing.assert_allclose(moved[:3, 3], c.move_points(b_from_a, pose[:3, 3]))
     np.testing.assert_allclose(c.move_pose(np.linalg.inv(b_from_a), moved), pose, atol=1e-9)
     points = RNG.normal(size=(4, 5, 3))
-    np.testing.assert_allclose(c.move_points(np.linalg.inv(b_from_a), c.move_points(b_from_a, points)), points, atol=1e-9)
-    # a pixel stays on its ray: what the moved camera sees of the moved point is what the camera saw of the point, scaled
+    np.testing.assert_allclose(
+        c.move_points(np.linalg.inv(b_from_a), c.move_points(b_from_a, points)), points, atol=1e-9
+    )
+    # a pixel stays on its ray: what the moved camera sees of the moved point is what the camera saw
+    # of the point, scaled
     seen = np.linalg.inv(pose) @ np.append(points[0, 0], 1)
     seen_moved = np.linalg.inv(moved) @ np.append(c.move_points(b_from_a, points[0, 0]), 1)
     np.testing.assert_allclose(seen_moved[:3], seen[:3] * c.scale_of(b_from_a), atol=1e-9)
@@ -86,14 +91,21 @@ def test_directions_and_lat_long(u, v):
 
 
 def test_axes_of_the_lat_long_map():
-    np.testing.assert_allclose(c.uv_from_direction([[1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])[:, 0], [0.25, 0.5, 0.75, 0.0])
+    np.testing.assert_allclose(
+        c.uv_from_direction([[1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])[:, 0],
+        [0.25, 0.5, 0.75, 0.0],
+    )
     np.testing.assert_allclose(c.uv_from_direction([[0, 1, 0], [0, -1, 0]])[:, 1], [0, 1])
 
 
 def test_texels_and_their_solid_angles():
     directions = c.environment_directions(6, 10)
     rows, cols = np.mgrid[:6, :10]
-    np.testing.assert_allclose(c.uv_from_direction(directions), np.stack([(cols + 0.5) / 10, (rows + 0.5) / 6], -1), atol=1e-12)
+    np.testing.assert_allclose(
+        c.uv_from_direction(directions),
+        np.stack([(cols + 0.5) / 10, (rows + 0.5) / 6], -1),
+        atol=1e-12,
+    )
     weights = c.environment_solid_angles(6, 10)
     assert weights.sum() == pytest.approx(4 * np.pi)
     np.testing.assert_allclose((directions * weights[..., None]).sum((0, 1)), 0, atol=1e-12)
@@ -119,5 +131,7 @@ def test_sampling_and_turning_of_a_map():
     np.testing.assert_allclose(c.sample_environment(env, d), smooth(d), atol=0.02)
     turn = exp_so3([0.4, 0.9, -0.3])
     turned = c.rotate_environment(env, turn)
-    np.testing.assert_allclose(c.sample_environment(turned, d @ turn.T), smooth(d), atol=0.02)  # light from d in a comes from R d in b
+    np.testing.assert_allclose(
+        c.sample_environment(turned, d @ turn.T), smooth(d), atol=0.02
+    )  # light from d in a comes from R d in b
     np.testing.assert_allclose(c.rotate_environment(turned, turn.T), env, atol=0.03)

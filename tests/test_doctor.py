@@ -24,7 +24,9 @@ def test_this_machine_is_examined(tmp_path, monkeypatch):
     assert by_name["libLLVM"].ok and by_name["gradient on cpu"].ok and "cpu" in ran
     assert doctor.verdict(checks) == EXIT_OK
     said = json.loads(doctor.as_json(checks))
-    assert said["ok"] and {"Python", "wheels", "libLLVM", "CUDA", "memory", "disk", "ffmpeg"} <= {c["name"] for c in said["checks"]}
+    assert said["ok"] and {"Python", "wheels", "libLLVM", "CUDA", "memory", "disk", "ffmpeg"} <= {
+        c["name"] for c in said["checks"]
+    }
     text = doctor.as_text(checks)
     assert "Relit can run on this machine." in text and str(tmp_path) in text
 
@@ -85,9 +87,17 @@ def test_a_dying_or_wrong_compiler_is_reported_not_suffered(monkeypatch, program
 
 
 def test_missing_wheels_and_extras(monkeypatch, tmp_path):
-    monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda _: ["numpy", "no-such-wheel>=2", 'other; extra == "dev"'])
+    monkeypatch.setattr(
+        doctor.importlib.metadata,
+        "requires",
+        lambda _: ["numpy", "no-such-wheel>=2", 'other; extra == "dev"'],
+    )
     check = doctor._wheels()
-    assert check.ok is False and check.found == "not installed: no-such-wheel" and check.fix == "make setup"
+    assert (
+        check.ok is False
+        and check.found == "not installed: no-such-wheel"
+        and check.fix == "make setup"
+    )
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
     extras = doctor._extras()

@@ -10,15 +10,15 @@ from cv2 import imwrite as cv_write
 from two_pawns import two_pawns
 
 from relit.asset.asset import load_asset, save_asset
-from relit.cameras.se3 import look_at
 from relit.edit import as_shown, camera_of, edit, insert
 from relit.errors import UserError
 from relit.files import digests
+from relit.geometry.se3 import look_at
 from relit.images import read_data, read_image, write_linear, write_srgb
+from relit.reference.mitsuba_scene import build_scene, render
+from relit.reference.photographed import as_photographed
+from relit.reference.pile import build_pile, instance_ids
 from relit.relight import relight
-from relit.rendering.mitsuba_scene import build_scene, render
-from relit.rendering.photographed import as_photographed
-from relit.rendering.pile import build_pile, instance_ids
 from relit.scene import Asset, Camera, Flash, Instance
 
 
@@ -29,9 +29,13 @@ def run(tmp_path_factory):
     mesh, material, poses, ground, environment = two_pawns()
     camera = Camera(72, 54, 80.0, 80.0, 36.0, 27.0, look_at([0, 3.5, 5.0], (0, 0.4, 0)))
     instances = (Instance(10, poses[0]), Instance(20, poses[1]))
-    asset = Asset(mesh, material, poses[0], environment, (("photo.png", camera),), {}, None, instances, ground)
+    asset = Asset(
+        mesh, material, poses[0], environment, (("photo.png", camera),), {}, None, instances, ground
+    )
     pile = build_pile(mesh, material, poses, ground)
-    picture = render(build_scene(pile.mesh, pile.material, np.eye(4), environment), camera, spp=64, seed=9)
+    picture = render(
+        build_scene(pile.mesh, pile.material, np.eye(4), environment), camera, spp=64, seed=9
+    )
     write_srgb(folder / "photo.png", np.clip(picture[..., :3], 0, 1))
     return save_asset(folder / "asset", asset), folder / "photo.png"
 
@@ -43,7 +47,11 @@ def test_the_photo_changes_only_where_the_object_and_what_it_lights_are(run, tmp
     assert np.abs(after - before)[:6].max() < 0.06  # far from the objects
     changed = np.abs(after - before).max(-1) > 0.15
     assert changed.mean() > 0.03 and (after[changed][:, 0] > after[changed][:, 1]).mean() > 0.9
-    assert np.allclose(load_asset(tmp_path / "red").material.base_color.reshape(-1, 3)[0], [0.8, 0.05, 0.05], atol=0.01)
+    assert np.allclose(
+        load_asset(tmp_path / "red").material.base_color.reshape(-1, 3)[0],
+        [0.8, 0.05, 0.05],
+        atol=0.01,
+    )
 
 
 def test_a_removed_instance_leaves_ground_without_its_shadow(run, tmp_path):
@@ -65,10 +73,19 @@ def test_a_removed_instance_leaves_ground_without_its_shadow(run, tmp_path):
 def test_no_rim_of_a_removed_instance_stays_where_the_model_is_too_small(run, tmp_path, labels):
     folder, photo = run
     asset = load_asset(folder)
-    thin = replace(asset.mesh, vertices=(asset.mesh.vertices * np.float32([0.6 if labels else 0.85, 1, 1])).astype(np.float32))
+    thin = replace(
+        asset.mesh,
+        vertices=(asset.mesh.vertices * np.float32([0.6 if labels else 0.85, 1, 1])).astype(
+            np.float32
+        ),
+    )
     poses = [i.world_from_object for i in asset.instances]
     true = build_pile(asset.mesh, asset.material, poses, asset.ground)
-    ids = instance_ids(build_scene(true.mesh, true.material, np.eye(4), asset.environment), true, asset.cameras[0][1])
+    ids = instance_ids(
+        build_scene(true.mesh, true.material, np.eye(4), asset.environment),
+        true,
+        asset.cameras[0][1],
+    )
     save_asset(tmp_path / "thin", replace(asset, mesh=thin))
     write_srgb(tmp_path / "photo.png", read_image(photo).rgb)
     if labels:
@@ -78,14 +95,18 @@ def test_no_rim_of_a_removed_instance_stays_where_the_model_is_too_small(run, tm
     left = np.ptp(after, axis=-1)[ids == 1]  # the ground is grey, the object is not
     assert np.ptp(read_image(photo).rgb, axis=-1)[ids == 1].max() > 0.2 and left.max() < 0.1
     kept = ids == 0
-    assert np.abs(after - read_image(photo).rgb)[kept].max(-1).mean() < 0.05  # the other one is the photo's
+    assert (
+        np.abs(after - read_image(photo).rgb)[kept].max(-1).mean() < 0.05
+    )  # the other one is the photo's
 
 
 def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):
     folder, photo = run
     camera = load_asset(folder).cameras[0][1]
     foot = camera.project(np.array([0.0, 0.0, 0.9]))[:2]
-    out = insert(folder, folder, tmp_path / "new.png", photo=photo, at=tuple(foot), size=0.6, spp=32)
+    out = insert(
+        folder, folder, tmp_path / "new.png", photo=photo, at=tuple(foot), size=0.6, spp=32
+    )
     before, after = read_image(photo).rgb, read_image(out).rgb
     u, v = foot.astype(int)
     assert np.abs(after - before)[v - 8 : v - 1, u - 2 : u + 3].mean() > 0.04  # its body
@@ -104,37 +125,82 @@ def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):
 
 @pytest.mark.parametrize("kind", ["collection", "flash"])
 def test_a_photo_is_changed_under_its_own_light(run, tmp_path, kind):
-    """Of a collection it is four times as bright as the median of the lights; of a flash capture there is no environment at all."""
+    """Of a collection it is four times as bright as the median of the lights; of a flash capture
+    there is no environment at all."""
     pile = load_asset(run[0])
     one = replace(pile, instances=(), ground=None, world_from_asset=np.eye(4))
     if kind == "collection":
-        asset = replace(one, lights=(4 * one.environment, one.environment), cameras=(one.cameras[0], ("other.png", one.cameras[0][1])))
+        asset = replace(
+            one,
+            lights=(4 * one.environment, one.environment),
+            cameras=(one.cameras[0], ("other.png", one.cameras[0][1])),
+        )
     else:
-        material = replace(one.material, diffuse=one.material.base_color, metallic=np.zeros((1, 1), np.float32))
+        material = replace(
+            one.material, diffuse=one.material.base_color, metallic=np.zeros((1, 1), np.float32)
+        )
         flash = Flash(np.array([-0.5, 0.2, 0.0]), np.full(3, 60.0))
         asset = replace(one, material=material, environment=None, flash=flash)
     shown = as_photographed(asset)("photo.png", asset.cameras[0][1], spp=64)
     write_srgb(tmp_path / "photo.png", np.clip(shown[..., :3], 0, 1))
-    edit(save_asset(tmp_path / "asset", asset), tmp_path / "same", photo=tmp_path / "photo.png", tint=(1, 1, 1), spp=32)
-    before, after = read_image(tmp_path / "photo.png").rgb, read_image(tmp_path / "same" / "photo.png").rgb
+    edit(
+        save_asset(tmp_path / "asset", asset),
+        tmp_path / "same",
+        photo=tmp_path / "photo.png",
+        tint=(1, 1, 1),
+        spp=32,
+    )
+    before, after = (
+        read_image(tmp_path / "photo.png").rgb,
+        read_image(tmp_path / "same" / "photo.png").rgb,
+    )
     inside = shown[..., 3] > 0.99
-    assert before[inside].mean() > 0.05 and after[inside].mean() == pytest.approx(before[inside].mean(), rel=0.08)
-    edit(tmp_path / "asset", tmp_path / "dark", photo=tmp_path / "photo.png", tint=(0.2, 0.2, 0.2), spp=32)
-    assert read_image(tmp_path / "dark" / "photo.png").rgb[inside].mean() < 0.75 * before[inside].mean()
+    assert before[inside].mean() > 0.05 and after[inside].mean() == pytest.approx(
+        before[inside].mean(), rel=0.08
+    )
+    edit(
+        tmp_path / "asset",
+        tmp_path / "dark",
+        photo=tmp_path / "photo.png",
+        tint=(0.2, 0.2, 0.2),
+        spp=32,
+    )
+    assert (
+        read_image(tmp_path / "dark" / "photo.png").rgb[inside].mean()
+        < 0.75 * before[inside].mean()
+    )
 
 
 def test_the_pile_under_another_light(run, tmp_path):
     """From the photo's camera all objects on their ground; on a turntable the object alone."""
     folder, asset = run[0], load_asset(run[0])
     write_linear(tmp_path / "even.exr", np.ones((8, 16, 3), np.float32))
-    file = relight(folder, tmp_path / "even.exr", tmp_path / "photo", cameras="capture", spp=8, exr=True)[1]
+    file = relight(
+        folder, tmp_path / "even.exr", tmp_path / "photo", cameras="capture", spp=8, exr=True
+    )[1]
     shown, camera = read_data(file), asset.cameras[0][1]
-    bare = render(build_scene(asset.mesh, asset.material, asset.world_from_asset, np.ones((8, 16, 3), np.float32)), camera, spp=8)
+    bare = render(
+        build_scene(
+            asset.mesh, asset.material, asset.world_from_asset, np.ones((8, 16, 3), np.float32)
+        ),
+        camera,
+        spp=8,
+    )
     for x in (-1.0, 1.0):
         u, v, _ = camera.project(np.array([x, 0.6, 0.0])).astype(int)
         assert np.ptp(shown[v, u, :3]) > 0.05, x  # the objects are coloured
     assert (shown[..., 3] > 0.99).mean() > 0.7 > (bare[..., 3] > 0.99).mean()  # the ground
-    turned = read_data(relight(folder, tmp_path / "even.exr", tmp_path / "orbit", cameras="orbit:1", size=48, spp=8, exr=True)[1])
+    turned = read_data(
+        relight(
+            folder,
+            tmp_path / "even.exr",
+            tmp_path / "orbit",
+            cameras="orbit:1",
+            size=48,
+            spp=8,
+            exr=True,
+        )[1]
+    )
     assert turned[0, 0, 3] == 0 and turned[-1, 0, 3] == 0
 
 
@@ -145,7 +211,9 @@ def test_another_photo_is_refused(run, tmp_path):
     write_srgb(tmp_path / "holiday.png", read_image(run[1]).rgb)
     for change in (
         lambda: edit(run[0], tmp_path / "a", photo=tmp_path / "holiday.png", roughness=0.5),
-        lambda: insert(run[0], run[0], tmp_path / "x.png", photo=tmp_path / "holiday.png", at=(5, 5)),
+        lambda: insert(
+            run[0], run[0], tmp_path / "x.png", photo=tmp_path / "holiday.png", at=(5, 5)
+        ),
     ):
         with pytest.raises(UserError, match="none of the photos") as error:
             change()
@@ -154,7 +222,8 @@ def test_another_photo_is_refused(run, tmp_path):
 
 @pytest.fixture(scope="module")
 def two(run, tmp_path_factory):
-    """(asset folder, folder of photos): the same pile in two photos from different sides; the second one's labels are its own."""
+    """(asset folder, folder of photos): the same pile in two photos from different sides; the
+    second one's labels are its own."""
     folder, asset = tmp_path_factory.mktemp("two"), load_asset(run[0])
     poses = [i.world_from_object for i in asset.instances]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
@@ -164,7 +233,9 @@ def two(run, tmp_path_factory):
     for name, camera in cameras:
         write_srgb(folder / name, np.clip(render(scene, camera, spp=64, seed=9)[..., :3], 0, 1))
     ids = instance_ids(scene, pile, second)
-    cv_write(str(folder / "b" / "photo_labels.png"), np.array([20, 10, 0], np.uint8)[ids])  # the other way round
+    cv_write(
+        str(folder / "b" / "photo_labels.png"), np.array([20, 10, 0], np.uint8)[ids]
+    )  # the other way round
     meta = {"inputs": digests(folder, [name for name, _ in cameras])}
     return save_asset(folder / "asset", replace(asset, cameras=cameras, meta=meta)), folder
 
@@ -172,7 +243,10 @@ def two(run, tmp_path_factory):
 def test_the_camera_is_that_of_the_photo(two, tmp_path):
     run, folder = two
     asset = load_asset(run)
-    assert [camera_of(asset, folder / name)[0] for name in ("a/photo.png", "b/photo.png")] == ["a/photo.png", "b/photo.png"]
+    assert [camera_of(asset, folder / name)[0] for name in ("a/photo.png", "b/photo.png")] == [
+        "a/photo.png",
+        "b/photo.png",
+    ]
     (tmp_path / "copy.png").write_bytes((folder / "b" / "photo.png").read_bytes())
     assert camera_of(asset, tmp_path / "copy.png")[0] == "b/photo.png"  # by its content
     (tmp_path / "photo.png").write_bytes((folder / "b" / "photo.png").read_bytes())
@@ -188,10 +262,14 @@ def test_the_second_photo_of_a_pile_is_changed_from_its_own_camera(two, tmp_path
     before, camera = read_image(photo).rgb, asset.cameras[1][1]
     edit(run, tmp_path / "same", photo=photo, tint=(1, 1, 1), spp=16)
     after = read_image(tmp_path / "same" / "photo.png").rgb
-    assert np.abs(after - before).mean() < 0.03  # an unchanged material lies where the photo shows it
+    assert (
+        np.abs(after - before).mean() < 0.03
+    )  # an unchanged material lies where the photo shows it
     edit(run, tmp_path / "one", photo=photo, remove=[20], spp=16)
     after = read_image(tmp_path / "one" / "photo.png").rgb
-    (u, v, _), (x, y, _) = (camera.project(np.array([s, 0.6, 0.0])).astype(int) for s in (1.0, -1.0))
+    (u, v, _), (x, y, _) = (
+        camera.project(np.array([s, 0.6, 0.0])).astype(int) for s in (1.0, -1.0)
+    )
     assert np.ptp(after[v - 2 : v + 3, u - 2 : u + 3].reshape(-1, 3).mean(0)) < 0.06  # grey ground
     assert np.abs(after - before)[y - 3 : y + 4, x - 3 : x + 4].mean() < 0.02  # the other one stays
     foot = camera.project(np.array([1.0, 0.0, 1.6]))[:2]

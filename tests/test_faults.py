@@ -1,4 +1,5 @@
-"""Wrong input gets an answer: what, why, fix and the right exit code, through the real command line; nothing is overwritten."""
+"""Wrong input gets an answer: what, why, fix and the right exit code, through the real command
+line; nothing is overwritten."""
 
 from __future__ import annotations
 
@@ -12,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from relit import cli
-from relit.cameras.se3 import look_at
+from relit.cli import main as cli
 from relit.conventions import world_from_gl_camera
+from relit.geometry.se3 import look_at
 from relit.images import write_linear
 
 SIDE, FOV = 48, 0.7
@@ -26,7 +27,8 @@ def eye(i, n=6):
 
 
 def picture(i, n=6):
-    """RGBA (48, 48, 4) uint8: a ball of radius .7 at the origin with stripes, seen from `eye(i)`."""
+    """RGBA (48, 48, 4) uint8: a ball of radius .7 at the origin with stripes, seen from
+    `eye(i)`."""
     pose = look_at(eye(i, n), np.zeros(3))
     focal = 0.5 * SIDE / np.tan(0.5 * FOV)
     x, y = np.meshgrid(np.arange(SIDE) + 0.5 - SIDE / 2, np.arange(SIDE) + 0.5 - SIDE / 2)
@@ -65,7 +67,8 @@ def photos_only(folder):
     (folder / "transforms.json").unlink()
 
 
-# ---------------------------------------------------------------- the table: how the input is spoilt, the exit code, what is said
+# ---------------------------------------------------------------- the table: how the input is
+# spoilt, the exit code, what is said
 
 
 def empty(f):
@@ -162,7 +165,9 @@ def no_json(f):
 
 def nan_pose(f):
     text = (f / "transforms.json").read_text()
-    (f / "transforms.json").write_text(text.replace("3.0", "NaN", 1) if "3.0" in text else text.replace("0.8", "NaN", 1))
+    (f / "transforms.json").write_text(
+        text.replace("3.0", "NaN", 1) if "3.0" in text else text.replace("0.8", "NaN", 1)
+    )
 
 
 def no_focal(f):
@@ -219,11 +224,23 @@ def answered(code, err, expected, said):
     assert "why: " in err or "fix: " in err
 
 
-@pytest.mark.parametrize("spoil, code, said", FAULTS, ids=lambda v: v.__name__ if callable(v) else None)
+@pytest.mark.parametrize(
+    "spoil, code, said", FAULTS, ids=lambda v: v.__name__ if callable(v) else None
+)
 def test_spoilt_input(capsys, tmp_path, capture, spoil, code, said):
     spoil(capture)
     before = {p: p.read_bytes() for p in capture.rglob("*") if p.is_file()}
-    got, out, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--quality", "draft", "--device", "cpu")
+    got, out, err = relit(
+        capsys,
+        "reconstruct",
+        capture,
+        "-o",
+        tmp_path / "run",
+        "--quality",
+        "draft",
+        "--device",
+        "cpu",
+    )
     answered(got, err, code, said)
     assert out == ""
     assert before == {p: p.read_bytes() for p in capture.rglob("*") if p.is_file()}
@@ -234,7 +251,12 @@ def test_the_unspoilt_capture_is_recognised(capsys, capture):
     """The table above proves nothing if this fails."""
     code, out, _ = relit(capsys, "inspect", capture, "--json")
     found = json.loads(out)
-    assert code == 0 and found["photos"] == 6 and found["cameras"] == "given" and found["sizes"] == [[48, 48]]
+    assert (
+        code == 0
+        and found["photos"] == 6
+        and found["cameras"] == "given"
+        and found["sizes"] == [[48, 48]]
+    )
     assert all(0.05 < share < 0.6 for share in found["masks"].values())
     assert np.linalg.norm(found["sphere"]["centre"]) < 0.3 and 0.7 < found["sphere"]["radius"] < 1.1
     code, out, _ = relit(capsys, "inspect", capture)
@@ -247,7 +269,9 @@ def test_what_can_be_mended_is_mended_and_said(capsys, capture):
     code, out, _ = relit(capsys, "inspect", capture, "--json")
     found = json.loads(out)
     assert code == 0 and found["photos"] == 5
-    assert any("inverted" in note for note in found["notes"]) and any("p5.png" in note for note in found["notes"])
+    assert any("inverted" in note for note in found["notes"]) and any(
+        "p5.png" in note for note in found["notes"]
+    )
     assert all(share < 0.6 for share in found["masks"].values())
 
 
@@ -286,10 +310,16 @@ def test_input_that_is_not_there(capsys, tmp_path):
 
 def test_config_file_with_an_unknown_key(capsys, tmp_path, capture):
     config = tmp_path / "c.toml"
-    wrong = {"qualty = 'draft'\n": "unknown key 'qualty'", "quality = 'drft'\n": "Did you mean 'draft'?", "= 3": "cannot be read"}
+    wrong = {
+        "qualty = 'draft'\n": "unknown key 'qualty'",
+        "quality = 'drft'\n": "Did you mean 'draft'?",
+        "= 3": "cannot be read",
+    }
     for text, said in wrong.items():
         config.write_text(text)
-        got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--config", config)
+        got, _, err = relit(
+            capsys, "reconstruct", capture, "-o", tmp_path / "run", "--config", config
+        )
         answered(got, err, 2, said)
     config.write_text("seed = 'many'\n")
     got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--config", config)
@@ -313,13 +343,15 @@ def test_full_disk(capsys, tmp_path, capture, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--quality", "draft")
+    got, _, err = relit(
+        capsys, "reconstruct", capture, "-o", tmp_path / "run", "--quality", "draft"
+    )
     monkeypatch.undo()
     answered(got, err, 5, "the disk is full")
 
 
 def test_too_little_memory(capsys, tmp_path, capture, monkeypatch):
-    from relit import plan
+    from relit import job as plan
 
     monkeypatch.setattr(plan, "available_memory", lambda: 2e8)
     got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
@@ -329,7 +361,17 @@ def test_too_little_memory(capsys, tmp_path, capture, monkeypatch):
 
 def test_no_libllvm_in_a_fresh_process(tmp_path, capture):
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": str(tmp_path / "nowhere.so")}
-    command = [sys.executable, "-m", "relit", "reconstruct", str(capture), "-o", str(tmp_path / "run"), "--device", "cpu"]
+    command = [
+        sys.executable,
+        "-m",
+        "relit",
+        "reconstruct",
+        str(capture),
+        "-o",
+        str(tmp_path / "run"),
+        "--device",
+        "cpu",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60)
     answered(done.returncode, done.stderr, 5, "libLLVM")
     assert "apt-get install" in done.stderr
@@ -352,12 +394,15 @@ def test_verbs_that_need_an_asset(capsys, tmp_path, monkeypatch, verb, flags):
 def test_a_page_that_is_not_built(capsys, tmp_path, monkeypatch):
     """A checkout without node: every other verb works, and these two say what builds it."""
     from relit.asset.asset import save_asset
-    from relit.capture.procedural import pawn
     from relit.scene import Asset
+    from relit.synthesize.procedural import pawn
 
     save_asset(tmp_path / "run/asset", Asset(*pawn(6, 8, 8), np.eye(4)))
     monkeypatch.setattr("relit.viewer.page.PAGE", tmp_path / "nowhere.html")
-    for words in (["view", tmp_path / "run", "--no-browser"], ["export", tmp_path / "run", "-o", tmp_path / "x.html"]):
+    for words in (
+        ["view", tmp_path / "run", "--no-browser"],
+        ["export", tmp_path / "run", "-o", tmp_path / "x.html"],
+    ):
         got, _, err = relit(capsys, *words)
         answered(got, err, 5, "make viewer")
     got, _, err = relit(capsys, "view", tmp_path / "run", "--port", "99999")

@@ -1,4 +1,5 @@
-"""Wrong input of flash, duplicates and collection through the command line: what is said, the exit code, no asset; nothing is fitted."""
+"""Wrong input of flash, duplicates and collection through the command line: what is said, the exit
+code, no asset; nothing is fitted."""
 
 from __future__ import annotations
 
@@ -12,11 +13,13 @@ from test_faults import SIDE, answered, edit, picture, relit, write_capture
 
 BALL = ["--sphere", "0,0,0,0.9"]
 
-# ---------------------------------------------------------------- flash: the ball of `write_capture` under a lamp at the camera
+# ---------------------------------------------------------------- flash: the ball of
+# `write_capture` under a lamp at the camera
 
 
 def flash_capture(folder):
-    """Six photos with cameras; the ball darkens towards its outline, as under a flash, and nothing else is lit."""
+    """Six photos with cameras; the ball darkens towards its outline, as under a flash, and nothing
+    else is lit."""
     write_capture(folder)
     repaint(folder, lambda rgb, inside, _: rgb * 0.6)
     return folder
@@ -26,8 +29,12 @@ def repaint(folder, change, mode="RGBA"):
     """change(rgb (48, 48, 3) in [0, 1], inside (48, 48, 1) bool, number of the photo) -> rgb."""
     for i in range(6):
         rgba = picture(i)
-        rgb = np.clip(change(rgba[..., :3] / 255, rgba[..., 3:] > 127, i) * 255, 0, 255).astype(np.uint8)
-        Image.fromarray(np.concatenate([rgb, rgba[..., 3:]], -1)).convert(mode).save(folder / f"images/p{i}.png")
+        rgb = np.clip(change(rgba[..., :3] / 255, rgba[..., 3:] > 127, i) * 255, 0, 255).astype(
+            np.uint8
+        )
+        Image.fromarray(np.concatenate([rgb, rgba[..., 3:]], -1)).convert(mode).save(
+            folder / f"images/p{i}.png"
+        )
 
 
 def black(f):
@@ -35,7 +42,11 @@ def black(f):
 
 
 def lit_room(f):
-    repaint(f, lambda rgb, inside, i: np.where(inside, rgb, np.random.default_rng(i).random(rgb.shape)), "RGB")
+    repaint(
+        f,
+        lambda rgb, inside, i: np.where(inside, rgb, np.random.default_rng(i).random(rgb.shape)),
+        "RGB",
+    )
 
 
 def bright_wall(f):
@@ -47,19 +58,28 @@ def over_exposed(f):
 
 
 def one_place(f):
-    edit(f, lambda c: [frame.update(transform_matrix=c["frames"][0]["transform_matrix"]) for frame in c["frames"]])
+    edit(
+        f,
+        lambda c: [
+            frame.update(transform_matrix=c["frames"][0]["transform_matrix"])
+            for frame in c["frames"]
+        ],
+    )
     for i in range(1, 6):
         shutil.copy(f / "images/p0.png", f / f"images/p{i}.png")
 
 
-# ---------------------------------------------------------------- duplicates: three discs in a photo
+# ---------------------------------------------------------------- duplicates: three discs in a
+# photo
 
 
 def pile(folder):
     folder.mkdir()
     y, x = np.mgrid[:96, :160]
     labels = sum((k + 1) * 40 * ((x - 30 - 48 * k) ** 2 + (y - 48) ** 2 < 18**2) for k in range(3))
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8)).save(folder / "pile.png")
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8)).save(
+        folder / "pile.png"
+    )
     relabel(folder, labels)
     return folder
 
@@ -94,7 +114,8 @@ def tiny_instances(f):
     relabel(f, labels)
 
 
-# ---------------------------------------------------------------- collection: six photos of the ball with masks
+# ---------------------------------------------------------------- collection: six photos of the
+# ball with masks
 
 
 def collection(folder):
@@ -128,7 +149,9 @@ def unknown_quadrant(f):
 
 
 def quadrants_of_others(f):
-    frames = [{"image_name": f"IMG_{i}.jpg", "quadrant": ["Left", "Center", "Front"]} for i in range(6)]
+    frames = [
+        {"image_name": f"IMG_{i}.jpg", "quadrant": ["Left", "Center", "Front"]} for i in range(6)
+    ]
     (f / "quadrants.json").write_text(json.dumps({"frames": frames}))
 
 
@@ -168,7 +191,9 @@ FAULTS = [
 KINDS = {flash_capture: "flash", pile: "duplicates", collection: "collection"}
 
 
-@pytest.mark.parametrize("make, spoil, flags, code, said", FAULTS, ids=lambda v: v.__name__ if callable(v) else None)
+@pytest.mark.parametrize(
+    "make, spoil, flags, code, said", FAULTS, ids=lambda v: v.__name__ if callable(v) else None
+)
 def test_spoilt_input_of_a_kind(capsys, tmp_path, make, spoil, flags, code, said):
     folder = make(tmp_path / "photos")
     spoil(folder)
@@ -182,7 +207,9 @@ def test_spoilt_input_of_a_kind(capsys, tmp_path, make, spoil, flags, code, said
 @pytest.mark.parametrize("make", KINDS, ids=lambda m: m.__name__)
 def test_unspoilt_input_of_a_kind(capsys, tmp_path, make):
     """The table above proves nothing if this fails."""
-    code, out, err = relit(capsys, "inspect", make(tmp_path / "photos"), "--capture", KINDS[make], "--json")
+    code, out, err = relit(
+        capsys, "inspect", make(tmp_path / "photos"), "--capture", KINDS[make], "--json"
+    )
     assert code == 0 and json.loads(out)["capture"] == KINDS[make], err
 
 

@@ -1,4 +1,5 @@
-"""The guide is true: its examples run, its commands parse, its links lead somewhere, its tables name what is there."""
+"""The guide is true: its examples run, its commands parse, its links lead somewhere, its tables
+name what is there."""
 
 from __future__ import annotations
 
@@ -15,13 +16,13 @@ import pytest
 from test_faults import write_capture
 
 from relit.asset.asset import load_asset
+from relit.cli.verbs import VERBS, parser_for
 from relit.errors import UserError
 from relit.evaluate.collection import DEFINITIONS as COLLECTION
 from relit.evaluate.definitions import DEFINITIONS
 from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS as DUPLICATES
 from relit.evaluate.flash import FLASH_DEFINITIONS as FLASH
 from relit.files import parse_toml
-from relit.verbs import VERBS, parser_for
 from relit.viewer.page import PAGE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,8 +48,8 @@ def example(monkeypatch, capsys, number, *argv) -> str:
 
 
 def test_examples_in_their_order(monkeypatch, capsys, folder):
-    import relit.fit.multiview as multiview
-    from relit.evaluate import report
+    import relit.fit.multiview.recipe as multiview
+    from relit.report import page as report
 
     monkeypatch.setitem(multiview.PRESETS, "draft", TINY)
     for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1}.items():
@@ -63,7 +64,10 @@ def test_examples_in_their_order(monkeypatch, capsys, folder):
     example(monkeypatch, capsys, 5, run, folder / "glossy.glb")
     from relit.asset.gltf import read_asset_file
 
-    assert read_asset_file(folder / "glossy.glb")[1].roughness.max() <= 0.26 and np.isfinite(load_asset(run).mesh.vertices).all()
+    assert (
+        read_asset_file(folder / "glossy.glb")[1].roughness.max() <= 0.26
+        and np.isfinite(load_asset(run).mesh.vertices).all()
+    )
 
 
 def test_examples_are_numbered_and_say_how_they_are_run():
@@ -108,7 +112,14 @@ def stands(name: str) -> bool:
         return False
     body = ast.parse((SOURCE / f"{module}.py").read_text()).body
     for attribute in attributes:
-        body = next((n.body for n in body if isinstance(n, (ast.FunctionDef, ast.ClassDef)) and n.name == attribute), None)
+        body = next(
+            (
+                n.body
+                for n in body
+                if isinstance(n, (ast.FunctionDef, ast.ClassDef)) and n.name == attribute
+            ),
+            None,
+        )
         if body is None:
             return False
     return True
@@ -116,34 +127,57 @@ def stands(name: str) -> bool:
 
 def test_every_piece_of_code_that_the_equations_and_the_method_name_is_there():
     parts = {p.name for p in SOURCE.iterdir() if p.is_dir()} | {"tests", "tools"}
-    text = "".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("equations.md", "method.md"))
+    text = "".join(
+        (ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("equations.md", "method.md")
+    )
     names = [n for n in re.findall(r"`([\w./]+)`", text) if "/" in n and n.split("/")[0] in parts]
     assert len(names) > 60 and [n for n in names if not stands(n)] == []
 
 
 def told_flags(verb, kind) -> set[str]:
-    """The flags that docs/flags.md tells of a verb, and of a kind of its, each under its own heading."""
+    """The flags that docs/flags.md tells of a verb, and of a kind of its, each under its own
+    heading."""
     text = (ROOT / "docs/flags.md").read_text(encoding="utf-8")
     sections = dict(part.split("\n", 1) for part in re.split(r"^##+ relit ", text, flags=re.M)[1:])
-    found = sections[verb] + (sections.get(f"{kind}: flags of its own" if " " in kind else kind, "") if kind else "")
-    return {o for line in found.splitlines() if line.startswith("| `-") for o in re.findall(r"`(--?[a-z][a-z-]*)`", line.split(" | ")[0])}
+    found = sections[verb] + (
+        sections.get(f"{kind}: flags of its own" if " " in kind else kind, "") if kind else ""
+    )
+    return {
+        o
+        for line in found.splitlines()
+        if line.startswith("| `-")
+        for o in re.findall(r"`(--?[a-z][a-z-]*)`", line.split(" | ")[0])
+    }
 
 
-@pytest.mark.parametrize("verb, kind", [(v, k) for v, spec in VERBS.items() for k in (list(spec.kinds) or [None])])
+@pytest.mark.parametrize(
+    "verb, kind", [(v, k) for v, spec in VERBS.items() for k in (list(spec.kinds) or [None])]
+)
 def test_every_flag_of_every_verb_is_told_where_it_is_looked_for(verb, kind):
-    known = {o for a in parser_for(verb, [kind] if kind else [])._actions if a.dest != "help" for o in a.option_strings}
+    known = {
+        o
+        for a in parser_for(verb, [kind] if kind else [])._actions
+        if a.dest != "help"
+        for o in a.option_strings
+    }
     assert told_flags(verb, kind and f"{verb} {kind}") == known
 
 
 def test_every_figure_is_explained():
     told = set(re.findall(r"^\| `([a-z_0-9]+)` \|", (ROOT / "docs/figures.md").read_text(), re.M))
-    assert told == {name for some in (DEFINITIONS, FLASH, COLLECTION, DUPLICATES) for name in some} and len(told) > 10
+    assert (
+        told == {name for some in (DEFINITIONS, FLASH, COLLECTION, DUPLICATES) for name in some}
+        and len(told) > 10
+    )
 
 
 def test_every_dependency_is_listed_with_its_licence():
     text = (ROOT / "docs/licences.md").read_text().lower()
     project = parse_toml((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = [*project["dependencies"], *[n for names in project["optional-dependencies"].values() for n in names]]
+    wanted = [
+        *project["dependencies"],
+        *[n for names in project["optional-dependencies"].values() for n in names],
+    ]
     names = [re.split(r"[\s<>=!~;\[]", w, maxsplit=1)[0].lower() for w in wanted]
     for folder in ("viewer", "tools/validator"):
         package = json.loads((ROOT / folder / "package.json").read_text())
@@ -154,9 +188,14 @@ def test_every_dependency_is_listed_with_its_licence():
 
 def test_what_is_published_carries_the_page_and_its_notices():
     assert (
-        "viewer/static" in (ROOT / "pyproject.toml").read_text() and "graft src/relit/viewer/static" in (ROOT / "MANIFEST.in").read_text()
+        "viewer/static" in (ROOT / "pyproject.toml").read_text()
+        and "graft src/relit/viewer/static" in (ROOT / "MANIFEST.in").read_text()
     )
     if not PAGE.is_file():
         pytest.skip("the page is not built (make viewer)")
     text = PAGE.read_text(encoding="utf-8")
-    assert "three.js authors" in text[:6000] and "Garrett Johnson" in text[:6000] and "Permission is hereby granted" in text[:6000]
+    assert (
+        "three.js authors" in text[:6000]
+        and "Garrett Johnson" in text[:6000]
+        and "Permission is hereby granted" in text[:6000]
+    )

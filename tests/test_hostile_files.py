@@ -1,5 +1,5 @@
-"""Damaged and hostile files: every reader answers with a UserError or reads the file; nothing is unpickled, allocated without bound,
-or read from outside its folder."""
+"""Damaged and hostile files: every reader answers with a UserError or reads the file; nothing is
+unpickled, allocated without bound, or read from outside its folder."""
 
 from __future__ import annotations
 
@@ -23,19 +23,21 @@ from PIL import Image
 
 from relit.asset.asset import read_cameras, save_asset
 from relit.asset.gltf import read_asset_file, write_glb
-from relit.cameras.se3 import look_at
-from relit.capture import open_capture
-from relit.capture.procedural import pawn
+from relit.capture.open import open_capture
 from relit.conventions import world_from_gl_camera
 from relit.errors import UserError
 from relit.files import load_arrays
+from relit.geometry.se3 import look_at
 from relit.images import read_header, read_image, read_small, write_linear
 from relit.images.opencv import decode_bytes, decode_file
 from relit.lighting.spherical_gaussians import read_json as read_gaussians
 from relit.masks.files import read_mask
 from relit.scene import Asset, Camera, Flash, Ground, Instance
+from relit.synthesize.procedural import pawn
 
-FUZZ = settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+FUZZ = settings(
+    max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+)
 
 # how a file is spoilt: cut to a share, bytes overwritten at shares of its length, a piece repeated
 cuts = st.one_of(st.none(), st.floats(0, 1))
@@ -43,7 +45,8 @@ pokes = st.lists(st.tuples(st.floats(0, 0.999), st.binary(min_size=1, max_size=8
 
 
 def spoilt(data: bytes, cut, changes, head: int = 0) -> bytes:
-    """head: the first bytes that stay as they are, so that the reader gets beyond its first look."""
+    """head: the first bytes that stay as they are, so that the reader gets beyond its first
+    look."""
     out = bytearray(data if cut is None else data[: int(cut * len(data))])
     for where, content in changes:
         at = head + int(where * max(len(out) - head, 0))
@@ -95,12 +98,17 @@ def test_a_tiff_of_absurd_width_is_told(tmp_path):
         if struct.unpack_from("<H", data, at)[0] == 256:  # ImageWidth
             struct.pack_into("<HII", data, at + 2, 4, 1, 2**21)
     (tmp_path / "a.tif").write_bytes(data)
-    assert decode_bytes(bytes(data), cv2.IMREAD_UNCHANGED) is None and decode_file(tmp_path / "a.tif", cv2.IMREAD_UNCHANGED) is None
+    assert (
+        decode_bytes(bytes(data), cv2.IMREAD_UNCHANGED) is None
+        and decode_file(tmp_path / "a.tif", cv2.IMREAD_UNCHANGED) is None
+    )
     with pytest.raises(UserError, match=r"a\.tif"):
         read_image(tmp_path / "a.tif")
 
 
-@pytest.mark.parametrize("name", ["a.exr", "a.hdr", "a.png", "b.png", "c.png", "a.jpg", "a.tif", "a.webp"])
+@pytest.mark.parametrize(
+    "name", ["a.exr", "a.hdr", "a.png", "b.png", "c.png", "a.jpg", "a.tif", "a.webp"]
+)
 @pytest.mark.filterwarnings("ignore")
 def test_spoilt_pictures(valid, tmp_path, name):
     path = tmp_path / name
@@ -156,7 +164,9 @@ def test_senseless_values_in_a_model(valid, tmp_path):
     def run(where, new):
         text = json.dumps(replaced(document, where, new)).encode()
         text += b" " * (-len(text) % 4)
-        head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
+        head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack(
+            "<I4s", len(text), b"JSON"
+        )
         path.write_bytes(head + text + rest)
         answers(read_asset_file, path)
 
@@ -170,7 +180,16 @@ def frames(folder, n=4):
         Image.fromarray(np.full((8, 8, 3), 40 * i, np.uint8)).save(folder / f"images/{i}.png")
         pose = world_from_gl_camera(look_at([3 * np.sin(i), 1, 3 * np.cos(i)], np.zeros(3)))
         out.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
-    return {"w": 8, "h": 8, "fl_x": 10.0, "fl_y": 10.0, "cx": 4.0, "cy": 4.0, "k1": 0.0, "frames": out}
+    return {
+        "w": 8,
+        "h": 8,
+        "fl_x": 10.0,
+        "fl_y": 10.0,
+        "cx": 4.0,
+        "cy": 4.0,
+        "k1": 0.0,
+        "frames": out,
+    }
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -256,10 +275,17 @@ def test_no_pickle_is_ever_opened(tmp_path, monkeypatch):
 
 def png_of(width, height, rows):
     def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
 
 
 BOMBS = """
@@ -285,28 +311,57 @@ def test_small_files_that_claim_to_be_huge(tmp_path):
     write_linear(tmp_path / "a.exr", np.zeros((4, 4, 3), np.float32))
     data = (tmp_path / "a.exr").read_bytes()
     for i, window in enumerate(
-        [(0, 0, 10**6, 10**6), (0, 0, 2**31 - 1, 2**31 - 1), (5, 5, 0, 0), (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1)]
+        [
+            (0, 0, 10**6, 10**6),
+            (0, 0, 2**31 - 1, 2**31 - 1),
+            (5, 5, 0, 0),
+            (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1),
+        ]
     ):
-        (tmp_path / f"{i}.exr").write_bytes(data.replace(struct.pack("<4i", 0, 0, 3, 3), struct.pack("<4i", *window)))
-    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 100000\n" + b"\2\2\x7f\xff" * 8)
+        (tmp_path / f"{i}.exr").write_bytes(
+            data.replace(struct.pack("<4i", 0, 0, 3, 3), struct.pack("<4i", *window))
+        )
+    (tmp_path / "a.hdr").write_bytes(
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 100000\n" + b"\2\2\x7f\xff" * 8
+    )
     bomb = base64.b64encode(png_of(60_000, 60_000, b"\0" * 100)).decode()
-    textured = {"asset": {"version": "2.0"}, "images": [{"uri": "data:image/png;base64," + bomb}], "textures": [{"source": 0}]}
+    textured = {
+        "asset": {"version": "2.0"},
+        "images": [{"uri": "data:image/png;base64," + bomb}],
+        "textures": [{"source": 0}],
+    }
     textured |= {
         "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
     }
     triangle = base64.b64encode(np.eye(3, dtype="<f4").tobytes()).decode()
-    textured |= {"buffers": [{"byteLength": 36, "uri": "data:application/octet-stream;base64," + triangle}]}
+    textured |= {
+        "buffers": [{"byteLength": 36, "uri": "data:application/octet-stream;base64," + triangle}]
+    }
     textured |= {
         "bufferViews": [{"buffer": 0, "byteLength": 36}],
         "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
     }
     (tmp_path / "texture.gltf").write_text(
-        json.dumps({**textured, "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}]})
+        json.dumps(
+            {
+                **textured,
+                "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}],
+            }
+        )
     )
-    many = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 12, "uri": "data:application/octet-stream;base64,AAAAAAAAAAAAAAAA"}]}
-    many |= {"bufferViews": [{"buffer": 0, "byteLength": 12}], "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+    many = {
+        "asset": {"version": "2.0"},
+        "buffers": [
+            {"byteLength": 12, "uri": "data:application/octet-stream;base64,AAAAAAAAAAAAAAAA"}
+        ],
+    }
+    many |= {
+        "bufferViews": [{"buffer": 0, "byteLength": 12}],
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+    }
     many |= {
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "count": 10**10, "type": "VEC3"},
@@ -314,16 +369,22 @@ def test_small_files_that_claim_to_be_huge(tmp_path):
         ]
     }
     for i, accessor in enumerate((0, 1)):
-        (tmp_path / f"{i}.gltf").write_text(json.dumps({**many, "meshes": [{"primitives": [{"attributes": {"POSITION": accessor}}]}]}))
+        (tmp_path / f"{i}.gltf").write_text(
+            json.dumps(
+                {**many, "meshes": [{"primitives": [{"attributes": {"POSITION": accessor}}]}]}
+            )
+        )
     files = sorted(str(p) for p in tmp_path.iterdir())
-    done = subprocess.run([sys.executable, "-c", BOMBS, *files], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", BOMBS, *files], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) < 700  # MB
 
 
 ZIP_BOMB = """
 import sys
-from relit.capture import open_capture
+from relit.capture.open import open_capture
 from relit.errors import UserError
 try:
     open_capture(sys.argv[1])
@@ -339,14 +400,18 @@ def test_a_zip_bomb_of_arrays(tmp_path):
         archive.open("world_mat_0.npy", "w") as file,
     ):
         head = io.BytesIO()
-        np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (2**29,)})
+        np.lib.format.write_array_header_1_0(
+            head, {"descr": "<f8", "fortran_order": False, "shape": (2**29,)}
+        )
         file.write(head.getvalue())
         for _ in range(64):
             file.write(b"\0" * (1 << 20))
     (tmp_path / "image").mkdir()
     for i in range(4):
         Image.new("RGB", (8, 8)).save(tmp_path / f"image/{i:03d}.png")
-    done = subprocess.run([sys.executable, "-c", ZIP_BOMB, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", ZIP_BOMB, str(tmp_path)], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 0 and int(done.stdout) < 700, done.stderr
 
 
@@ -356,7 +421,13 @@ def test_a_zip_bomb_of_arrays(tmp_path):
 def test_models_name_no_files_outside(tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "secret.bin").write_bytes(b"\0" * 64)
-    for uri in ("../secret.bin", str(tmp_path / "secret.bin"), "file:///etc/passwd", "%2e%2e/secret.bin", "http://example.com/a.bin"):
+    for uri in (
+        "../secret.bin",
+        str(tmp_path / "secret.bin"),
+        "file:///etc/passwd",
+        "%2e%2e/secret.bin",
+        "http://example.com/a.bin",
+    ):
         document = {
             "asset": {"version": "2.0"},
             "buffers": [{"byteLength": 36, "uri": uri}],
@@ -376,15 +447,33 @@ def test_asset_json_of_every_kind(tmp_path):
 
     mesh, material = pawn(6, 8, 8)
     cameras = (("a.png", Camera(8, 8, 10, 10, 4, 4, np.eye(4))),)
-    more = {"instances": (Instance(1, np.eye(4)), Instance(2, None, "hidden")), "flash": Flash(np.zeros(3), np.ones(3))}
+    more = {
+        "instances": (Instance(1, np.eye(4)), Instance(2, None, "hidden")),
+        "flash": Flash(np.zeros(3), np.ones(3)),
+    }
     ground = Ground(np.zeros(3), np.array([0.0, 1.0, 0.0]), 4.0, np.full(3, 0.5))
-    save_asset(tmp_path / "asset", Asset(mesh, material, np.eye(4), np.ones((4, 8, 3), np.float32), cameras, ground=ground, **more))
+    save_asset(
+        tmp_path / "asset",
+        Asset(
+            mesh,
+            material,
+            np.eye(4),
+            np.ones((4, 8, 3), np.float32),
+            cameras,
+            ground=ground,
+            **more,
+        ),
+    )
     names = ("asset.json", "cameras.json", "instances.json", "lights/flash.json")
     good = {name: json.loads((tmp_path / "asset" / name).read_text()) for name in names}
     assert len(load_asset(tmp_path).instances) == 2 and load_asset(tmp_path).flash is not None
 
     @FUZZ
-    @given(st.sampled_from(sorted(good)), places, st.sampled_from([*SENSELESS, float("inf"), float("nan"), 10**400]))
+    @given(
+        st.sampled_from(sorted(good)),
+        places,
+        st.sampled_from([*SENSELESS, float("inf"), float("nan"), 10**400]),
+    )
     def run(name, where, new):
         (tmp_path / "asset" / name).write_text(json.dumps(replaced(good[name], where, new)))
         answers(load_asset, tmp_path)
@@ -403,11 +492,15 @@ def test_the_valid_files_are_read(valid, tmp_path):
         elif not name.endswith(".npz"):
             assert read_image(tmp_path / name).rgb.shape[2] == 3
     assert read_header(tmp_path / "a.jpg").focal > 0
-    (tmp_path / "light.json").write_text(json.dumps({"lobes": [{"axis": [0, 1, 0], "sharpness": 3.0, "amplitude": [1, 1, 1]}]}))
+    (tmp_path / "light.json").write_text(
+        json.dumps({"lobes": [{"axis": [0, 1, 0], "sharpness": 3.0, "amplitude": [1, 1, 1]}]})
+    )
     assert len(read_gaussians(tmp_path / "light.json").sharpness) == 1
     (tmp_path / "transforms.json").write_text(json.dumps(frames(tmp_path)))
     assert len(open_capture(tmp_path, masks="none").photos) == 4
-    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n")
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+    )
     for file in ("../secret.png", "/etc/passwd"):
         (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {file}\n")
         with pytest.raises(UserError, match="outside its folder"):
@@ -423,7 +516,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from shots import ring, write_colmap_text, write_photos
 import pycolmap
-from relit.capture import open_capture
+from relit.capture.open import open_capture
 from relit.errors import UserError
 root = Path(sys.argv[2])
 cameras = ring(4)
@@ -462,7 +555,12 @@ print(answers["read"], answers["refused"])
 def test_spoilt_colmap_models(tmp_path):
     """In another process: the reader is native code, which may end the process or read for ever."""
     here = Path(__file__).parent / "capture"
-    done = subprocess.run([sys.executable, "-c", COLMAP, str(here), str(tmp_path)], capture_output=True, text=True, timeout=100)
+    done = subprocess.run(
+        [sys.executable, "-c", COLMAP, str(here), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     read, refused = map(int, done.stdout.split())
     assert read > 10 and refused > 50
@@ -472,22 +570,40 @@ def test_spoilt_colmap_models(tmp_path):
 @pytest.mark.parametrize("name", ["cameras_sphere.npz", "poses_bounds.npy", "a_par.txt"])
 def test_spoilt_camera_arrays(tmp_path, name):
     (tmp_path / "image").mkdir()
-    poses = [np.linalg.inv(look_at([3 * np.sin(i), 1, 3 * np.cos(i)], np.zeros(3))) for i in range(4)]
+    poses = [
+        np.linalg.inv(look_at([3 * np.sin(i), 1, 3 * np.cos(i)], np.zeros(3))) for i in range(4)
+    ]
     for i in range(4):
         Image.fromarray(np.full((8, 8, 3), 40 * i, np.uint8)).save(tmp_path / f"image/{i:03d}.png")
     k = np.array([[10, 0, 4, 0], [0, 10, 4, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     path = tmp_path / name
     if name.endswith(".npz"):
-        np.savez(path, **{f"world_mat_{i}": k @ p for i, p in enumerate(poses)}, **{f"scale_mat_{i}": np.eye(4) for i in range(4)})
+        np.savez(
+            path,
+            **{f"world_mat_{i}": k @ p for i, p in enumerate(poses)},
+            **{f"scale_mat_{i}": np.eye(4) for i in range(4)},
+        )
     elif name.endswith(".npy"):
-        axes = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]])  # down, right, back
-        rows = [np.concatenate([np.column_stack([(np.linalg.inv(p) @ axes)[:3], [8, 8, 10]]).ravel(), [1, 5]]) for p in poses]
+        axes = np.array(
+            [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]]
+        )  # down, right, back
+        rows = [
+            np.concatenate(
+                [np.column_stack([(np.linalg.inv(p) @ axes)[:3], [8, 8, 10]]).ravel(), [1, 5]]
+            )
+            for p in poses
+        ]
         np.save(path, np.array(rows))
     else:
         (tmp_path / "image").rename(tmp_path / "other")
         for i in range(4):
             (tmp_path / f"other/{i:03d}.png").rename(tmp_path / f"{i:03d}.png")
-        line = lambda i, p: " ".join(map(str, [f"{i:03d}.png", *k[:3, :3].ravel(), *p[:3, :3].ravel(), *p[:3, 3]]))  # noqa: E731
+
+        def line(i, p):
+            return " ".join(
+                map(str, [f"{i:03d}.png", *k[:3, :3].ravel(), *p[:3, :3].ravel(), *p[:3, 3]])
+            )
+
         path.write_text("4\n" + "\n".join(line(i, p) for i, p in enumerate(poses)) + "\n")
     good = path.read_bytes()
     assert len(open_capture(tmp_path, masks="none").photos) == 4
@@ -522,7 +638,7 @@ def test_spoilt_obj_files(valid, tmp_path):
 
 
 def test_spoilt_configurations(tmp_path):
-    from relit.plan import plan_job
+    from relit.job import plan_job
 
     path = tmp_path / "config.toml"
     good = b'capture = "multiview"\nquality = "draft"\nseed = 3\nsphere = [0.0, 0.0, 0.0, 1.0]\n\n[settings]\nrays = 100\n'

@@ -53,7 +53,11 @@ def test_sixteen_bits_are_kept(tmp_path):
 
     codes = np.arange(4 * 5 * 3, dtype=np.uint16).reshape(4, 5, 3) * 3 + 30000
     cv2.imwrite(str(tmp_path / "a.png"), codes[..., ::-1])
-    np.testing.assert_allclose(images.read_image(tmp_path / "a.png").rgb, linear_from_srgb(codes / np.float32(65535)), rtol=1e-5)
+    np.testing.assert_allclose(
+        images.read_image(tmp_path / "a.png").rgb,
+        linear_from_srgb(codes / np.float32(65535)),
+        rtol=1e-5,
+    )
     assert len(np.unique(images.read_data(tmp_path / "a.png"))) == codes.size
 
 
@@ -68,7 +72,8 @@ def test_alpha_is_composited_on_black_in_linear_light(tmp_path):
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_exif_orientation_is_applied_once(tmp_path, orientation):
-    """A red upper left corner stays in the upper left corner of the upright picture, whatever the sensor's orientation."""
+    """A red upper left corner stays in the upper left corner of the upright picture, whatever the
+    sensor's orientation."""
     upright = np.zeros((24, 16, 3), np.uint8)
     upright[:8, :8, 0] = 255
     stored = {
@@ -77,10 +82,17 @@ def test_exif_orientation_is_applied_once(tmp_path, orientation):
     }[orientation]  # fmt: skip
     exif = PilImage.Exif()
     exif[0x0112] = orientation
-    PilImage.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "a.jpg", exif=exif, quality=95, subsampling=0)
+    PilImage.fromarray(np.ascontiguousarray(stored)).save(
+        tmp_path / "a.jpg", exif=exif, quality=95, subsampling=0
+    )
     image, header = images.read_image(tmp_path / "a.jpg"), images.read_header(tmp_path / "a.jpg")
     assert image.rgb.shape == (24, 16, 3) and (header.width, header.height) == (16, 24)
-    assert image.rgb[3, 3, 0] > 0.9 and image.rgb[20, 12, 0] < 0.1 and image.rgb[3, 12, 0] < 0.1 and image.rgb[20, 3, 0] < 0.1
+    assert (
+        image.rgb[3, 3, 0] > 0.9
+        and image.rgb[20, 12, 0] < 0.1
+        and image.rgb[3, 12, 0] < 0.1
+        and image.rgb[20, 3, 0] < 0.1
+    )
     np.testing.assert_allclose(images.read_small(tmp_path / "a.jpg", 64).rgb, image.rgb, atol=0.02)
     assert images.read_image(tmp_path / "a.jpg", upright=False).rgb.shape == (*stored.shape[:2], 3)
 
@@ -92,7 +104,11 @@ def test_sixteen_bit_files_turn_as_eight_bit_ones(tmp_path, orientation):
     exif = PilImage.Exif()
     exif[0x0112] = orientation
     PilImage.fromarray(codes).save(tmp_path / "a.png", exif=exif)
-    np.testing.assert_allclose(images.read_image(tmp_path / "a.png").rgb, linear_from_srgb(wide / np.float32(255)), rtol=1e-6)
+    np.testing.assert_allclose(
+        images.read_image(tmp_path / "a.png").rgb,
+        linear_from_srgb(wide / np.float32(255)),
+        rtol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -107,7 +123,11 @@ def test_orientation_of_a_png_in_a_raw_profile(tmp_path, orientation):
     info.add_text("Raw profile type exif", f"\nexif\n{len(block):8d}\n{block.hex()}\n", zip=True)
     PilImage.fromarray(codes).save(tmp_path / "a.png", pnginfo=info)
     image, header = images.read_image(tmp_path / "a.png"), images.read_header(tmp_path / "a.png")
-    np.testing.assert_allclose(image.rgb, linear_from_srgb(images.turn_upright(codes, orientation) / np.float32(255)), rtol=1e-6)
+    np.testing.assert_allclose(
+        image.rgb,
+        linear_from_srgb(images.turn_upright(codes, orientation) / np.float32(255)),
+        rtol=1e-6,
+    )
     assert (header.height, header.width, header.orientation) == (*image.rgb.shape[:2], orientation)
     np.testing.assert_allclose(images.read_small(tmp_path / "a.png", 64).rgb, image.rgb, atol=1e-5)
     assert images.read_image(tmp_path / "a.png", upright=False).rgb.shape == (24, 32, 3)
@@ -131,7 +151,17 @@ def test_nan_in_an_exr_is_refused_with_its_place(tmp_path):
 def write_tiff(path, array: np.ndarray, kind: int = 3, orientation: int = 1) -> None:
     """(H, W, C), one strip, as TIFF 6.0 says. kind: 1 of whole numbers, 3 of floats."""
     h, w, c = array.shape
-    shorts = {256: [w], 257: [h], 258: [8 * array.itemsize] * c, 259: [1], 262: [2], 277: [c], 274: [orientation], 278: [h], 284: [1]}
+    shorts = {
+        256: [w],
+        257: [h],
+        258: [8 * array.itemsize] * c,
+        259: [1],
+        262: [2],
+        277: [c],
+        274: [orientation],
+        278: [h],
+        284: [1],
+    }
     shorts |= {339: [kind] * c} | ({338: [2]} if c == 4 else {})
     tags = {k: (3, v) for k, v in shorts.items()} | {273: (4, [0]), 279: (4, [array.nbytes])}
     begin = 8 + 2 + 12 * len(tags) + 4
@@ -162,11 +192,19 @@ def test_a_tiff_is_turned_once(tmp_path, kind, orientation):
 
 @pytest.mark.parametrize("channels", [3, 4])
 def test_a_tiff_of_float_colours_is_linear(tmp_path, channels):
-    path, array = tmp_path / "a.tif", np.random.default_rng(0).uniform(0, 3, (6, 8, channels)).astype(np.float32)
+    path, array = (
+        tmp_path / "a.tif",
+        np.random.default_rng(0).uniform(0, 3, (6, 8, channels)).astype(np.float32),
+    )
     write_tiff(path, array, orientation=6)
     array = images.turn_upright(array, 6)
     header = images.read_header(path)
-    assert (header.width, header.height, header.alpha, header.orientation) == (6, 8, channels == 4, 6)
+    assert (header.width, header.height, header.alpha, header.orientation) == (
+        6,
+        8,
+        channels == 4,
+        6,
+    )
     for image in (images.read_image(path), images.read_small(path)):
         np.testing.assert_array_equal(image.rgb, array[..., :3])
         assert image.clipped is None and (image.alpha is None) == (channels == 3)
@@ -190,7 +228,10 @@ def test_a_tiff_of_floats_that_cannot_be_read_says_so(tmp_path, capfd):
 def test_a_tiff_of_grey_floats_is_linear_and_checked(tmp_path):
     grey = np.linspace(0, 2, 48, dtype=np.float32).reshape(6, 8)
     PilImage.fromarray(grey).save(tmp_path / "a.tif")
-    for rgb in (images.read_image(tmp_path / "a.tif").rgb, images.read_small(tmp_path / "a.tif").rgb):
+    for rgb in (
+        images.read_image(tmp_path / "a.tif").rgb,
+        images.read_small(tmp_path / "a.tif").rgb,
+    ):
         np.testing.assert_array_equal(rgb, np.repeat(grey[..., None], 3, axis=2))
     grey[2, 3] = np.nan
     PilImage.fromarray(grey).save(tmp_path / "a.tif")
@@ -221,7 +262,10 @@ def test_missing_unknown_and_oversized_files(tmp_path, monkeypatch):
         images.read_image(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("name, module, extra", [("a.heic", "pillow_heif", "relit[heic]"), ("a.nef", "rawpy", "relit[raw]")])
+@pytest.mark.parametrize(
+    "name, module, extra",
+    [("a.heic", "pillow_heif", "relit[heic]"), ("a.nef", "rawpy", "relit[raw]")],
+)
 def test_optional_formats_say_what_to_install(tmp_path, monkeypatch, name, module, extra):
     monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / name).write_bytes(b"x" * 64)
@@ -241,10 +285,14 @@ def test_small_copies_agree_with_the_whole_picture(tmp_path, suffix):
     small = images.read_small(tmp_path / f"a{suffix}", 32)
     assert max(small.rgb.shape) <= 64 and small.alpha is None
     h, w = small.rgb.shape[:2]
-    np.testing.assert_allclose(small.rgb, cv2.resize(array, (w, h), interpolation=cv2.INTER_AREA), atol=0.03)
+    np.testing.assert_allclose(
+        small.rgb, cv2.resize(array, (w, h), interpolation=cv2.INTER_AREA), atol=0.03
+    )
 
 
-@pytest.mark.parametrize("data, display", [((1, 1, 2, 3), (0, 0, 5, 4)), ((-1, -1, 4, 4), (0, 0, 3, 2))])
+@pytest.mark.parametrize(
+    "data, display", [((1, 1, 2, 3), (0, 0, 5, 4)), ((-1, -1, 4, 4), (0, 0, 3, 2))]
+)
 def test_the_display_window_of_an_exr_is_read(tmp_path, data, display):
     import OpenEXR
 
@@ -260,7 +308,9 @@ def test_the_display_window_of_an_exr_is_read(tmp_path, data, display):
     assert rgb.shape == (v1 + 1, u1 + 1, 3)
     for row, col in ((0, 0), (2, 1), (2, 2), (v1, u1)):
         inside = x0 <= col <= x1 and y0 <= row <= y1
-        np.testing.assert_array_equal(rgb[row, col], [col + 10, row + 10, col + 10] if inside else [0, 0, 0])
+        np.testing.assert_array_equal(
+            rgb[row, col], [col + 10, row + 10, col + 10] if inside else [0, 0, 0]
+        )
 
 
 def test_layers_of_an_exr(tmp_path):
@@ -268,7 +318,9 @@ def test_layers_of_an_exr(tmp_path):
 
     plane = np.full((3, 4), 2, np.float32)
     channels = {"Depth.Z": plane * 9, **{f"Image.{c}": plane * i for i, c in enumerate("RGB")}}
-    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as f:
+    with OpenEXR.File(
+        {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels
+    ) as f:
         f.write(str(tmp_path / "a.exr"))
     np.testing.assert_array_equal(images.read_image(tmp_path / "a.exr").rgb[0, 0], [0, 2, 4])
 
@@ -292,8 +344,12 @@ def test_encoders():
 
 # ---------------------------------------------------------------- colour profiles
 
-P3_TO_XYZ = np.array([[0.51512, 0.29198, 0.15710], [0.24120, 0.69225, 0.06657], [-0.00105, 0.04189, 0.78407]])  # adapted to D50
-SRGB_TO_XYZ = np.array([[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]])
+P3_TO_XYZ = np.array(
+    [[0.51512, 0.29198, 0.15710], [0.24120, 0.69225, 0.06657], [-0.00105, 0.04189, 0.78407]]
+)  # adapted to D50
+SRGB_TO_XYZ = np.array(
+    [[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]]
+)
 GAMMA = 2.19921875  # a curve of one number in an ICC profile: unsigned 8.8
 
 
@@ -303,17 +359,30 @@ def p3_profile(name=b"Display P3") -> bytes:
     def xyz(v):
         return b"XYZ " + bytes(4) + b"".join(struct.pack(">i", round(float(x) * 65536)) for x in v)
 
-    text = b"desc" + bytes(4) + struct.pack(">I", len(name) + 1) + name + bytes(1 + 4 + 4 + 2 + 1 + 67)
+    text = (
+        b"desc" + bytes(4) + struct.pack(">I", len(name) + 1) + name + bytes(1 + 4 + 4 + 2 + 1 + 67)
+    )
     curve = b"curv" + bytes(4) + struct.pack(">IH", 1, round(GAMMA * 256)) + bytes(2)
-    tags = {b"desc": text + bytes(-len(text) % 4), b"wtpt": xyz([0.9642, 1.0, 0.8249]), b"cprt": b"text" + bytes(4) + b"none" + bytes(4)}
+    tags = {
+        b"desc": text + bytes(-len(text) % 4),
+        b"wtpt": xyz([0.9642, 1.0, 0.8249]),
+        b"cprt": b"text" + bytes(4) + b"none" + bytes(4),
+    }
     for k, c in enumerate((b"r", b"g", b"b")):
         tags[c + b"XYZ"], tags[c + b"TRC"] = xyz(P3_TO_XYZ[:, k]), curve
     table, body, at = b"", b"", 128 + 4 + 12 * len(tags)
     for tag, data in tags.items():
         table += tag + struct.pack(">II", at + len(body), len(data))
         body += data
-    head = struct.pack(">I4sI4s4s4s", at + len(body), b"none", 0x02400000, b"mntr", b"RGB ", b"XYZ ")
-    head += struct.pack(">6H", 2026, 1, 1, 0, 0, 0) + b"acsp" + bytes(28) + xyz([0.9642, 1.0, 0.8249])[8:]
+    head = struct.pack(
+        ">I4sI4s4s4s", at + len(body), b"none", 0x02400000, b"mntr", b"RGB ", b"XYZ "
+    )
+    head += (
+        struct.pack(">6H", 2026, 1, 1, 0, 0, 0)
+        + b"acsp"
+        + bytes(28)
+        + xyz([0.9642, 1.0, 0.8249])[8:]
+    )
     return head.ljust(128, bytes(1)) + struct.pack(">I", len(tags)) + table + body
 
 
@@ -326,7 +395,11 @@ def test_display_p3_photos_are_carried_to_srgb(tmp_path, mode, suffix):
     codes = np.array([180, 90, 60, 200][: len(mode)], np.uint8)
     picture = Image.fromarray(np.broadcast_to(codes, (16, 16, len(mode))).copy())
     path = tmp_path / f"a{suffix}"
-    picture.save(path, icc_profile=p3_profile(), **({"quality": 100, "subsampling": 0} if suffix == ".jpg" else {}))
+    picture.save(
+        path,
+        icc_profile=p3_profile(),
+        **({"quality": 100, "subsampling": 0} if suffix == ".jpg" else {}),
+    )
     linear = (codes[:3] / 255.0) ** GAMMA
     expected = np.linalg.inv(SRGB_TO_XYZ) @ P3_TO_XYZ @ linear
     alpha = codes[3] / 255 if mode == "RGBA" else 1.0
@@ -334,7 +407,9 @@ def test_display_p3_photos_are_carried_to_srgb(tmp_path, mode, suffix):
     np.testing.assert_allclose(got.rgb[8, 8], expected * alpha, atol=0.01)
     assert np.abs(expected - linear).max() > 0.03  # the profile matters
     np.testing.assert_allclose(read_small(path, 8).rgb[4, 4], expected, atol=0.01)
-    np.testing.assert_allclose(images.read_data(path)[8, 8] * 255, codes, atol=1.01)  # data has no colour
+    np.testing.assert_allclose(
+        images.read_data(path)[8, 8] * 255, codes, atol=1.01
+    )  # data has no colour
     if mode == "RGBA":
         np.testing.assert_allclose(got.alpha, 200 / 255, atol=1e-6)
 

@@ -1,4 +1,5 @@
-"""What a machine can do to a job: kill it, fill the disk, take memory away, move its folder. The real fit, very small."""
+"""What a machine can do to a job: kill it, fill the disk, take memory away, move its folder. The
+real fit, very small."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ import pytest
 from PIL import Image
 from test_faults import answered, write_capture
 
-from relit import cli
 from relit.asset.asset import load_asset
-from relit.evaluate import report
+from relit.cli import main as cli
+from relit.report import page as report
 from relit.run import Run
 
 TINY = {
@@ -32,13 +33,19 @@ TINY = {
     "directions": 8,
     "light": 8,
 }
-WORDS = ["--quality", "draft", "--device", "cpu", *[w for k, v in TINY.items() for w in ("--set", f"{k}={v}")]]
+WORDS = [
+    "--quality",
+    "draft",
+    "--device",
+    "cpu",
+    *[w for k, v in TINY.items() for w in ("--set", f"{k}={v}")],
+]
 # the command line with a small report
 JOB = """
 import sys
-from relit.evaluate import report
+from relit.report import page as report
 report.SIDE, report.STILLS, report.SPP, report.SPP_COMPARED, report.VIEWS = 24, 2, 1, 1, 1
-from relit.cli import main
+from relit.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
 
@@ -62,7 +69,13 @@ def start(*words, limits=()):
             resource.setrlimit(which, (size, size))
 
     command = [sys.executable, "-c", JOB, *map(str, words)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=prepare if limits else None)
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=prepare if limits else None,
+    )
 
 
 def relit(capsys, *argv):
@@ -116,16 +129,28 @@ Run.stage = stage
 def test_kill_9_in_any_stage_and_the_same_command(capsys, capture, finished, tmp_path, stage):
     run = tmp_path / "run"
     words = ["reconstruct", capture, "-o", run, *WORDS]
-    process = subprocess.run([sys.executable, "-c", KILLED + JOB, stage, *map(str, words)], capture_output=True, timeout=100)
+    process = subprocess.run(
+        [sys.executable, "-c", KILLED + JOB, stage, *map(str, words)],
+        capture_output=True,
+        timeout=100,
+    )
     assert process.returncode == -signal.SIGKILL and not (run / "stages" / stage / "DONE").exists()
     assert not (run / "report.html").exists()
     code, _, err = relit(capsys, *words)
     assert code == 0, err
-    assert "Traceback" not in err and (run / "report.html").is_file() and (run / "photos/index.json").is_file()
+    assert (
+        "Traceback" not in err
+        and (run / "report.html").is_file()
+        and (run / "photos/index.json").is_file()
+    )
     a, b = load_asset(run), load_asset(finished)
-    assert a.environment.shape == b.environment.shape and abs(len(a.mesh.faces) - len(b.mesh.faces)) < 0.1 * len(b.mesh.faces)
+    assert a.environment.shape == b.environment.shape and abs(
+        len(a.mesh.faces) - len(b.mesh.faces)
+    ) < 0.1 * len(b.mesh.faces)
     assert np.abs(a.mesh.vertices.mean(0) - b.mesh.vertices.mean(0)).max() < 0.05
-    assert not list(run.rglob("*.part")) and not [p for p in run.iterdir() if p.name.startswith(".")]
+    assert not list(run.rglob("*.part")) and not [
+        p for p in run.iterdir() if p.name.startswith(".")
+    ]
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
@@ -133,7 +158,10 @@ def test_asked_to_stop(capture, tmp_path, number, code):
     run = tmp_path / "run"
     many = ["--set", "surface_steps=20000"]
     process = start("reconstruct", capture, "-o", run, *WORDS, *many)
-    assert stop_when(process, run / "log.txt", "material and light (surface pass): begun", number) == code
+    assert (
+        stop_when(process, run / "log.txt", "material and light (surface pass): begun", number)
+        == code
+    )
     log = (run / "log.txt").read_text(encoding="utf-8")
     assert "the same command" in log and "Traceback" not in log and not (run / "asset").exists()
 
@@ -154,7 +182,9 @@ def test_a_checkpoint_that_was_damaged(capsys, capture, finished, tmp_path):
     if code:
         answered(code, err, 3, "overwrite")
     else:
-        assert err.count("checkpoint.npz cannot be read") == 1 and (run / "asset/object.glb").is_file()
+        assert (
+            err.count("checkpoint.npz cannot be read") == 1 and (run / "asset/object.glb").is_file()
+        )
 
 
 def test_what_a_finished_stage_has_kept_was_damaged(capsys, capture, finished, tmp_path):
@@ -172,7 +202,9 @@ def test_what_a_finished_stage_has_kept_was_damaged(capsys, capture, finished, t
 def test_a_disk_that_fills_up(capsys, capture, tmp_path):
     """A limit on the size of files stands for a full disk: the same OSError from the same calls."""
     run = tmp_path / "run"
-    process = start("reconstruct", capture, "-o", run, *WORDS, limits=[(resource.RLIMIT_FSIZE, 30_000)])
+    process = start(
+        "reconstruct", capture, "-o", run, *WORDS, limits=[(resource.RLIMIT_FSIZE, 30_000)]
+    )
     _, err = process.communicate(timeout=100)
     answered(process.returncode, err, 5, "the disk is full")
     assert not (run / "asset").exists()
@@ -194,7 +226,9 @@ def test_a_photo_replaced_during_the_run(capture, tmp_path):
     words = ["reconstruct", photos, "-o", run, *WORDS, "--set", "surface_steps=80"]
     process = start(*words)
     log = run / "log.txt"
-    while process.poll() is None and not (log.exists() and "shape (volume pass): begun" in log.read_text(encoding="utf-8")):
+    while process.poll() is None and not (
+        log.exists() and "shape (volume pass): begun" in log.read_text(encoding="utf-8")
+    ):
         time.sleep(0.002)
     Image.new("RGBA", (48, 48), (255, 0, 0, 255)).save(photos / "images/p0.png")
     _, err = process.communicate(timeout=100)
@@ -216,7 +250,11 @@ def test_a_run_folder_that_was_moved(capsys, capture, finished, tmp_path):
     moved, photos = tmp_path / "anderswo/Lauf", tmp_path / "andere Fotos" / capture.name
     shutil.copytree(finished, moved)
     shutil.copytree(capture, photos)
-    texts = [p.read_text(encoding="utf-8", errors="ignore") for p in moved.rglob("*") if p.suffix in (".json", ".toml", ".jsonl", ".html")]
+    texts = [
+        p.read_text(encoding="utf-8", errors="ignore")
+        for p in moved.rglob("*")
+        if p.suffix in (".json", ".toml", ".jsonl", ".html")
+    ]
     assert not any(str(finished.parent) in t or str(capture.parent) in t for t in texts)
     for words in (["export", moved, "-o", tmp_path / "ü b.obj"], ["relight", moved, "--light", moved / "asset/lights/environment.exr",
                   "--cameras", "orbit:1", "--size", "16", "--spp", "1", "-o", tmp_path / "Bilder"]):  # fmt: skip
@@ -228,7 +266,14 @@ def test_a_run_folder_that_was_moved(capsys, capture, finished, tmp_path):
 
 def test_two_gigabytes_of_memory(capture, tmp_path):
     """Data segments and anonymous memory together: a draft goes through."""
-    process = start("reconstruct", capture, "-o", tmp_path / "run", *WORDS, limits=[(resource.RLIMIT_DATA, 2 << 30)])
+    process = start(
+        "reconstruct",
+        capture,
+        "-o",
+        tmp_path / "run",
+        *WORDS,
+        limits=[(resource.RLIMIT_DATA, 2 << 30)],
+    )
     _, err = process.communicate(timeout=100)
     assert process.returncode == 0, err
 
@@ -236,7 +281,14 @@ def test_two_gigabytes_of_memory(capture, tmp_path):
 def test_memory_that_runs_out(capture, tmp_path):
     """An answer, no traceback, and never a half written asset."""
     process = start(
-        "reconstruct", capture, "-o", tmp_path / "run", *WORDS, "--set", "texture=16384", limits=[(resource.RLIMIT_DATA, 2 << 30)]
+        "reconstruct",
+        capture,
+        "-o",
+        tmp_path / "run",
+        *WORDS,
+        "--set",
+        "texture=16384",
+        limits=[(resource.RLIMIT_DATA, 2 << 30)],
     )
     _, err = process.communicate(timeout=100)
     assert process.returncode != 0 and not (tmp_path / "run/asset").exists()
@@ -246,13 +298,18 @@ def test_memory_that_runs_out(capture, tmp_path):
 
 def test_a_photo_of_a_hundred_megapixels(tmp_path, capsys):
     folder = write_capture(tmp_path / "photos")
-    Image.fromarray(np.asarray(Image.open(folder / "images/p0.png"))[..., :3]).resize((10_000, 10_000)).save(
-        folder / "images/p0.jpg", quality=40
-    )
+    Image.fromarray(np.asarray(Image.open(folder / "images/p0.png"))[..., :3]).resize(
+        (10_000, 10_000)
+    ).save(folder / "images/p0.jpg", quality=40)
     job = "import sys\nfrom relit.images import read_image\nassert read_image(sys.argv[1]).rgb.shape == (10000, 10000, 3)\n"
     # its own peak: getrusage would count what the process held that started it
     job += "print(next(int(line.split()[1]) >> 10 for line in open('/proc/self/status') if line.startswith('VmHWM')))"
-    done = subprocess.run([sys.executable, "-c", job, str(folder / "images/p0.jpg")], capture_output=True, text=True, timeout=100)
+    done = subprocess.run(
+        [sys.executable, "-c", job, str(folder / "images/p0.jpg")],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
     assert int(done.stdout) < 2000, done.stderr  # MB: the pixels as float32 are 1144
     Image.new("1", (20_000, 10_001)).save(folder / "images/p1.png")
     code, _, err = relit(capsys, "inspect", folder)
@@ -270,10 +327,20 @@ sys.addaudithook(watch)
 
 def test_nothing_reaches_for_the_network(capture, tmp_path):
     words = ["reconstruct", capture, "-o", tmp_path / "run", *WORDS]
-    done = subprocess.run([sys.executable, "-c", OFFLINE + JOB, *map(str, words)], capture_output=True, text=True, timeout=100)
+    done = subprocess.run(
+        [sys.executable, "-c", OFFLINE + JOB, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
     assert done.returncode == 0, done.stderr
     reach = "import socket\nsocket.create_connection(('127.0.0.1', 9), timeout=1)"
-    assert "reached for the network" in subprocess.run([sys.executable, "-c", OFFLINE + reach], capture_output=True, text=True).stderr
+    assert (
+        "reached for the network"
+        in subprocess.run(
+            [sys.executable, "-c", OFFLINE + reach], capture_output=True, text=True
+        ).stderr
+    )
 
 
 FLAT = """
@@ -288,7 +355,7 @@ def watched(self, i, /, **losses):
     if i in (150, 500):
         seen[self.name, i] = resident()
 Stage.step = watched
-from relit.reconstruct import reconstruct
+from relit.reconstruction import reconstruct
 settings = {"levels": [16], "level_steps": [500], "rays": 128, "faces": 300, "texture": 16, "light": 4}
 settings |= {"surface_steps": 500, "points": 32, "directions": 4, "background": 16, "explore_steps": 500}
 reconstruct(sys.argv[1], sys.argv[2], quality="draft", device="cpu", settings=settings, masks=sys.argv[3], report=False)
@@ -297,19 +364,26 @@ for name in {n for n, _ in seen}:
 """
 
 
-@pytest.mark.parametrize("masks, passes", [("auto", {"volume", "surface"}), ("none", {"explore", "volume", "surface"})])
+@pytest.mark.parametrize(
+    "masks, passes", [("auto", {"volume", "surface"}), ("none", {"explore", "volume", "surface"})]
+)
 def test_memory_stays_flat_over_500_steps(capture, tmp_path, masks, passes):
     """Of every pass: what a step allocates it gives back."""
     command = [sys.executable, "-c", FLAT, str(capture), str(tmp_path / "run"), masks]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
-    grown = {line.split()[0]: float(line.split()[1]) for line in done.stdout.splitlines() if len(line.split()) == 2}
+    grown = {
+        line.split()[0]: float(line.split()[1])
+        for line in done.stdout.splitlines()
+        if len(line.split()) == 2
+    }
     assert passes <= set(grown), done.stdout
     assert all(mb < 6 for mb in grown.values()), grown
 
 
 def flash_photos(folder: Path) -> tuple[Path, list[str]]:
-    """The ball with cameras in a file that tells no kind, and the words that make it a small flash job."""
+    """The ball with cameras in a file that tells no kind, and the words that make it a small flash
+    job."""
     return write_capture(folder), ["--capture", "flash", "--set", "hollows=0"]
 
 
@@ -326,14 +400,37 @@ def collection_photos(folder: Path) -> tuple[Path, list[str]]:
 def test_kill_9_in_the_surface_pass_of_other_kinds(capsys, tmp_path, make):
     photos, flags = make(tmp_path / "photos")
     tiny = [w for k, v in TINY.items() if k != "light" for w in ("--set", f"{k}={v}")]
-    words = ["reconstruct", photos, "-o", tmp_path / "run", "--quality", "draft", "--device", "cpu", *tiny, *flags]
-    process = subprocess.run([sys.executable, "-c", KILLED + JOB, "surface", *map(str, words)], capture_output=True, timeout=100)
+    words = [
+        "reconstruct",
+        photos,
+        "-o",
+        tmp_path / "run",
+        "--quality",
+        "draft",
+        "--device",
+        "cpu",
+        *tiny,
+        *flags,
+    ]
+    process = subprocess.run(
+        [sys.executable, "-c", KILLED + JOB, "surface", *map(str, words)],
+        capture_output=True,
+        timeout=100,
+    )
     assert process.returncode == -signal.SIGKILL, process.stderr.decode()
     stages = tmp_path / "run/stages"
-    assert (stages / "volume/DONE").exists() and not (stages / "surface/DONE").exists() and not (tmp_path / "run/asset").exists()
+    assert (
+        (stages / "volume/DONE").exists()
+        and not (stages / "surface/DONE").exists()
+        and not (tmp_path / "run/asset").exists()
+    )
     before = (stages / "volume/DONE").stat().st_mtime_ns
     code, _, err = relit(capsys, *words)
     assert code == 0, err
     assert (stages / "volume/DONE").stat().st_mtime_ns == before  # what was done is not done again
     asset = load_asset(tmp_path / "run")
-    assert len(asset.mesh.faces) > 50 and np.isfinite(asset.material.base_color).all() and (tmp_path / "run/report.html").is_file()
+    assert (
+        len(asset.mesh.faces) > 50
+        and np.isfinite(asset.material.base_color).all()
+        and (tmp_path / "run/report.html").is_file()
+    )

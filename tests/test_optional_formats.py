@@ -1,4 +1,5 @@
-"""HEIC and RAW photos and the segmenter, with the packages of the optional extras; without them each test says what is missing."""
+"""HEIC and RAW photos and the segmenter, with the packages of the optional extras; without them
+each test says what is missing."""
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from relit.errors import UserError
 from relit.images.read import read_small
 from relit.masks.segment import segmenter
 
-COLOURS = np.array([[[0.5, 0.1, 0.1], [0.1, 0.5, 0.1]], [[0.1, 0.1, 0.5], [0.25, 0.25, 0.25]]], np.float32)  # of the four quarters
+COLOURS = np.array(
+    [[[0.5, 0.1, 0.1], [0.1, 0.5, 0.1]], [[0.1, 0.1, 0.5], [0.25, 0.25, 0.25]]], np.float32
+)  # of the four quarters
 
 
 def quarters(height=96, width=160):
@@ -43,7 +46,9 @@ def test_heic_photos_stand_upright_and_know_their_focal_length(tmp_path, orienta
     stored.save(path, quality=95, exif=exif(orientation))
     picture, header = images.read_image(path), images.read_header(path)
     expected = turned(quarters(), orientation)
-    assert picture.rgb.shape == expected.shape and (header.height, header.width) == expected.shape[:2]
+    assert (
+        picture.rgb.shape == expected.shape and (header.height, header.width) == expected.shape[:2]
+    )
     np.testing.assert_allclose(middles(picture.rgb), middles(expected), atol=0.02)
     assert header.focal == pytest.approx(26 * np.hypot(160, 96) / 43.2666, rel=1e-3)
     np.testing.assert_allclose(middles(read_small(path, 48).rgb), middles(expected), atol=0.02)
@@ -70,7 +75,13 @@ def test_a_damaged_heic_is_answered(tmp_path):
 
 # ---------------------------------------------------------------- RAW
 
-XYZ_FROM_RGB = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])
+XYZ_FROM_RGB = np.array(
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.0721750],
+        [0.0193339, 0.1191920, 0.9503041],
+    ]
+)
 
 
 def rationals(values):
@@ -78,7 +89,8 @@ def rationals(values):
 
 
 def write_dng(path, rgb, orientation=1, white=16383, neutral=(1.0, 1.0, 1.0)):
-    """A DNG file of a camera that sees linear Rec.709 times `neutral`, as a Bayer mosaic of `rgb` (H, W, 3)."""
+    """A DNG file of a camera that sees linear Rec.709 times `neutral`, as a Bayer mosaic of `rgb`
+    (H, W, 3)."""
     tifffile = pytest.importorskip("tifffile", reason="comes with scikit-image")
     codes = (np.clip(rgb * np.array(neutral), 0, 1) * white).round().astype(np.uint16)
     mosaic = codes[..., 1].copy()
@@ -109,10 +121,14 @@ def test_raw_photos_are_linear_with_the_cameras_white_balance(tmp_path, orientat
     path = write_dng(tmp_path / "a.dng", quarters(), orientation, neutral=(0.5, 1.0, 0.7))
     picture, header = images.read_image(path), images.read_header(path)
     expected = turned(quarters(), orientation)
-    assert picture.rgb.shape == expected.shape and (header.height, header.width) == expected.shape[:2]
+    assert (
+        picture.rgb.shape == expected.shape and (header.height, header.width) == expected.shape[:2]
+    )
     assert header.orientation == orientation and picture.clipped is not None
     got = middles(picture.rgb)
-    np.testing.assert_allclose(got / got.max(), middles(expected) / 0.5, atol=0.01)  # exposure is free, colours and linearity are not
+    np.testing.assert_allclose(
+        got / got.max(), middles(expected) / 0.5, atol=0.01
+    )  # exposure is free, colours and linearity are not
     as_stored = images.read_image(path, upright=False).rgb
     np.testing.assert_allclose(middles(as_stored), turned_back(got, orientation), atol=1e-3)
     np.testing.assert_allclose(middles(read_small(path, 48).rgb), got, atol=0.01)
@@ -149,8 +165,14 @@ def write_model(path):
     h, t = onnx.helper, onnx.TensorProto
     weight = h.make_tensor("w", t.FLOAT, [1, 3, 1, 1], [0.0, 0.0, 1.0])
     nodes = [h.make_node("Conv", ["input.1", "w"], ["y"]), h.make_node("Sigmoid", ["y"], ["out"])]
-    ends = [h.make_tensor_value_info(n, t.FLOAT, [1, c, 320, 320]) for n, c in (("input.1", 3), ("out", 1))]
-    model = h.make_model(h.make_graph(nodes, "blue", ends[:1], ends[1:], [weight]), opset_imports=[h.make_opsetid("", 13)])
+    ends = [
+        h.make_tensor_value_info(n, t.FLOAT, [1, c, 320, 320])
+        for n, c in (("input.1", 3), ("out", 1))
+    ]
+    model = h.make_model(
+        h.make_graph(nodes, "blue", ends[:1], ends[1:], [weight]),
+        opset_imports=[h.make_opsetid("", 13)],
+    )
     model.ir_version = 8
     path.parent.mkdir(parents=True, exist_ok=True)
     onnx.save(model, path)
@@ -173,7 +195,7 @@ def test_a_capture_with_the_segmenters_masks(tmp_path, monkeypatch):
     pytest.importorskip("rembg", reason="needs rembg and onnxruntime (the extra `segment`)")
     monkeypatch.setenv("U2NET_HOME", str(tmp_path / "weights"))
     write_model(tmp_path / "weights" / "u2net.onnx")
-    from relit.capture import open_capture
+    from relit.capture.open import open_capture
 
     rng = np.random.default_rng(0)
     for i in range(3):

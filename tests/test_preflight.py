@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from relit import cli
-from relit.cameras.se3 import look_at
+from relit.cli import main as cli
 from relit.conventions import srgb_from_linear, world_from_gl_camera
 from relit.errors import UserError
-from relit.preflight import inspect
+from relit.geometry.se3 import look_at
 from relit.preflight.cameras import fundamental, match, widest_gap
 from relit.preflight.drift import drift, warnings_of
+from relit.preflight.inspect import inspect
 from relit.preflight.light import LIMB, check_flash_light, light_regime, limb_slopes, shading_fits
 from relit.preflight.look import Exif, look_at_photos, read_exif, sharpness
 from relit.scene import Camera, Capture, Photo, Pixels, Sphere
@@ -25,7 +25,9 @@ BALL = Sphere(np.zeros(3), 1.0)
 
 
 def eye(i, n):
-    return np.array([4 * np.sin(2 * np.pi * i / n), 1.0 + 0.4 * (i % 2), 4 * np.cos(2 * np.pi * i / n)])
+    return np.array(
+        [4 * np.sin(2 * np.pi * i / n), 1.0 + 0.4 * (i % 2), 4 * np.cos(2 * np.pi * i / n)]
+    )
 
 
 def pattern(p):
@@ -34,22 +36,31 @@ def pattern(p):
 
 
 def ball_photo(camera, light, surroundings=(0.2, 0.25, 0.3), mask=True):
-    """A Lambertian ball of radius .85 with the texture `pattern` under light(n, camera) -> (..., 1 or 3), before a plain backdrop."""
+    """A Lambertian ball of radius .85 with the texture `pattern` under light(n, camera) -> (..., 1
+    or 3), before a plain backdrop."""
     h, w = camera.height, camera.width
     v, u = np.mgrid[:h, :w] + 0.5
-    d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) @ camera.world_from_camera[:3, :3].T
+    d = (
+        np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+        @ camera.world_from_camera[:3, :3].T
+    )
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
     o = camera.centre
     b, q = d @ o, o @ o - 0.85**2
     hit = b * b > q
     n = (o + (-b - np.sqrt(np.maximum(b * b - q, 0)))[..., None] * d) / 0.85
-    rgb = np.where(hit[..., None], pattern(n) * light(n, camera), np.array(surroundings)).astype(np.float32)
+    rgb = np.where(hit[..., None], pattern(n) * light(n, camera), np.array(surroundings)).astype(
+        np.float32
+    )
     return Pixels(rgb, hit.astype(np.float32) if mask else None)
 
 
 def cameras(n=12, same=False):
     aims = np.random.default_rng(5).normal(size=(n, 3)) * 0.35 * (not same)
-    return [Camera(SIDE, SIDE, FOCAL, FOCAL, SIDE / 2, SIDE / 2, look_at(eye(0 if same else i, n), a)) for i, a in enumerate(aims)]
+    return [
+        Camera(SIDE, SIDE, FOCAL, FOCAL, SIDE / 2, SIDE / 2, look_at(eye(0 if same else i, n), a))
+        for i, a in enumerate(aims)
+    ]
 
 
 def capture(tmp_path, lights, surroundings=None, same=False, with_cameras=True, mask=True):
@@ -58,7 +69,9 @@ def capture(tmp_path, lights, surroundings=None, same=False, with_cameras=True, 
     for i, (camera, light) in enumerate(zip(cameras(len(lights), same), lights, strict=True)):
         around = (0.2, 0.25, 0.3) if surroundings is None else surroundings[i]
         pixels = ball_photo(camera, light, around, mask)
-        photos.append(Photo(f"{i}.png", lambda p=pixels: p, SIDE, SIDE, camera if with_cameras else None))
+        photos.append(
+            Photo(f"{i}.png", lambda p=pixels: p, SIDE, SIDE, camera if with_cameras else None)
+        )
     return Capture(tmp_path, "photos", tuple(photos), sphere=BALL if with_cameras else None)
 
 
@@ -81,26 +94,41 @@ def sun(seed):
 def test_light_regimes(tmp_path):
     assert light_regime(capture(tmp_path, [fixed] * 12))["guess"] == "fixed"
     dark = light_regime(capture(tmp_path, [flash] * 12, [(0.002, 0.002, 0.002)] * 12))
-    assert dark["guess"] == "flash" and dark["confidence"] > 0.5 and any("moves with it" in e for e in dark["evidence"])
+    assert (
+        dark["guess"] == "flash"
+        and dark["confidence"] > 0.5
+        and any("moves with it" in e for e in dark["evidence"])
+    )
     colours = np.random.default_rng(3).uniform(0.02, 0.8, (12, 3))
     varied = light_regime(capture(tmp_path, [sun(i) for i in range(12)], colours))
     assert varied["guess"] == "varied"
     moving = light_regime(capture(tmp_path, [sun(i) for i in range(6)], same=True))
     assert moving["guess"] == "moving light" and any("one place" in e for e in moving["evidence"])
-    assert light_regime(capture(tmp_path, [fixed] * 6, same=True))["guess"] == "fixed"  # a tripod alone is no moving lamp
+    assert (
+        light_regime(capture(tmp_path, [fixed] * 6, same=True))["guess"] == "fixed"
+    )  # a tripod alone is no moving lamp
 
 
 def test_light_regimes_without_cameras(tmp_path):
     assert light_regime(capture(tmp_path, [fixed] * 8, with_cameras=False))["guess"] == "fixed"
-    assert light_regime(capture(tmp_path, [flash] * 8, [(0.002,) * 3] * 8, with_cameras=False))["guess"] == "flash"
-    moving = light_regime(capture(tmp_path, [sun(i) for i in range(6)], same=True, with_cameras=False, mask=False))
+    assert (
+        light_regime(capture(tmp_path, [flash] * 8, [(0.002,) * 3] * 8, with_cameras=False))[
+            "guess"
+        ]
+        == "flash"
+    )
+    moving = light_regime(
+        capture(tmp_path, [sun(i) for i in range(6)], same=True, with_cameras=False, mask=False)
+    )
     assert moving["guess"] == "moving light"
 
 
 def test_shading_is_told_from_texture(tmp_path):
     spread, camera, _, facing = shading_fits(look_at_photos(capture(tmp_path, [flash] * 12)), BALL)
     assert spread > 0.2 and camera > 0.6 and facing > 0.5
-    _, camera, photo, _ = shading_fits(look_at_photos(capture(tmp_path, [sun(i) for i in range(12)])), BALL)
+    _, camera, photo, _ = shading_fits(
+        look_at_photos(capture(tmp_path, [sun(i) for i in range(12)])), BALL
+    )
     assert photo > 0.5 and camera < 0.35
     spread, _, _, _ = shading_fits(look_at_photos(capture(tmp_path, [fixed] * 12)), BALL)
     assert spread < 0.2
@@ -108,9 +136,14 @@ def test_shading_is_told_from_texture(tmp_path):
 
 
 def test_a_lamp_at_the_camera_is_told_from_the_outline(tmp_path):
-    """Without cameras or dark surroundings: only under a flash does the object darken evenly towards its outline."""
+    """Without cameras or dark surroundings: only under a flash does the object darken evenly
+    towards its outline."""
     slopes = limb_slopes(look_at_photos(capture(tmp_path, [flash] * 8, with_cameras=False)))
-    assert slopes.shape == (8, 3) and np.median(slopes[:, 2]) > LIMB and (np.abs(slopes[:, :2]).max(1) < slopes[:, 2]).all()
+    assert (
+        slopes.shape == (8, 3)
+        and np.median(slopes[:, 2]) > LIMB
+        and (np.abs(slopes[:, :2]).max(1) < slopes[:, 2]).all()
+    )
     assert light_regime(capture(tmp_path, [flash] * 8, with_cameras=False))["guess"] == "flash"
     slopes = limb_slopes(look_at_photos(capture(tmp_path, [fixed] * 8)))
     assert np.median(slopes[:, 2]) < LIMB
@@ -126,7 +159,9 @@ def told(capture):
 
 def test_a_flash_capture_is_let_through(tmp_path):
     assert told(capture(tmp_path, [flash] * 8, [(0.002,) * 3] * 8)) == []
-    assert told(capture(tmp_path, [flash] * 8, with_cameras=False)) == []  # before a visible backdrop, with masks
+    assert (
+        told(capture(tmp_path, [flash] * 8, with_cameras=False)) == []
+    )  # before a visible backdrop, with masks
 
 
 @pytest.mark.parametrize("with_cameras", [True, False])
@@ -142,8 +177,12 @@ def test_few_photos_are_not_refused(tmp_path):
 
 
 def test_one_viewpoint_under_a_moving_lamp_is_no_flash_capture(tmp_path):
-    with pytest.raises(UserError, match="all photos are taken from one place, under a light that moves"):
-        told(capture(tmp_path, [sun(i) for i in range(6)], same=True, with_cameras=False, mask=False))
+    with pytest.raises(
+        UserError, match="all photos are taken from one place, under a light that moves"
+    ):
+        told(
+            capture(tmp_path, [sun(i) for i in range(6)], same=True, with_cameras=False, mask=False)
+        )
 
 
 def test_what_is_uncertain_about_a_flash_is_said(tmp_path):
@@ -156,7 +195,9 @@ def with_alpha(folder, light):
     frames = []
     for i, camera in enumerate(cameras(14)):
         pixels = ball_photo(camera, light, (0.0, 0.0, 0.0))
-        rgba = np.concatenate([srgb_from_linear(np.clip(pixels.rgb, 0, 1)), pixels.mask[..., None]], -1)
+        rgba = np.concatenate(
+            [srgb_from_linear(np.clip(pixels.rgb, 0, 1)), pixels.mask[..., None]], -1
+        )
         Image.fromarray((rgba * 255 + 0.5).astype(np.uint8)).save(folder / f"{i}.png")
         pose = world_from_gl_camera(camera.world_from_camera).tolist()
         frames.append({"file_path": f"{i}.png", "transform_matrix": pose})
@@ -166,9 +207,10 @@ def with_alpha(folder, light):
 
 
 def test_the_light_is_looked_at_before_a_flash_reconstruction(tmp_path, monkeypatch):
-    """The environment-lit set with alpha is refused before anything is computed, and goes on when asked to; a flash set goes on."""
-    from relit.fit import flash as recipe
-    from relit.reconstruct import reconstruct
+    """The environment-lit set with alpha is refused before anything is computed, and goes on when
+    asked to; a flash set goes on."""
+    from relit.fit.flash import recipe
+    from relit.reconstruction import reconstruct
 
     class GoesOn(Exception):
         pass
@@ -190,10 +232,16 @@ def test_the_light_is_looked_at_before_a_flash_reconstruction(tmp_path, monkeypa
 
 
 def test_the_mug_is_told_about_its_light_first(shared, tmp_path):
-    from relit.reconstruct import reconstruct
+    from relit.reconstruction import reconstruct
 
     with pytest.raises(UserError, match="taken from one place, under a light that moves"):
-        reconstruct(shared / "real" / "flash_mug", tmp_path / "run", capture="flash", quality="draft", report=False)
+        reconstruct(
+            shared / "real" / "flash_mug",
+            tmp_path / "run",
+            capture="flash",
+            quality="draft",
+            report=False,
+        )
 
 
 def test_blur_exposure_and_tint_are_found(tmp_path):
@@ -204,17 +252,25 @@ def test_blur_exposure_and_tint_are_found(tmp_path):
         return Pixels(rgb * [1.5, 1, 1] if i == 7 else rgb, pixels.mask)
 
     c = capture(tmp_path, [fixed] * 9)
-    photos = [Photo(p.name, lambda p=p, i=i: changed(i, p.load()), SIDE, SIDE, p.camera) for i, p in enumerate(c.photos)]
+    photos = [
+        Photo(p.name, lambda p=p, i=i: changed(i, p.load()), SIDE, SIDE, p.camera)
+        for i, p in enumerate(c.photos)
+    ]
     found = drift(look_at_photos(Capture(tmp_path, "photos", tuple(photos))))
     assert found["blurred"] == ["3.png"]
     rows = {r["name"]: r for r in found["photos"]}
     assert rows["5.png"]["ev"] == pytest.approx(2 + rows["4.png"]["ev"], abs=0.5)
-    assert rows["7.png"]["red"] == pytest.approx(np.log2(1.5), abs=0.2) and abs(rows["7.png"]["blue"]) < 0.2
+    assert (
+        rows["7.png"]["red"] == pytest.approx(np.log2(1.5), abs=0.2)
+        and abs(rows["7.png"]["blue"]) < 0.2
+    )
     assert found["exif_exposure_spread"] is None and found["cameras"] == []
     shifted = found | {"exif_exposure_spread": 1.4, "tint_spread": 1.0}
     said = [w["what"] for w in warnings_of(shifted, True)]
     assert len(said) == 3 and "exposure: 1.4 EV" in said[0] and "colour varies" in said[1]
-    assert [w["what"] for w in warnings_of(shifted, True, from_anywhere=True)] == said[2:]  # photos from anywhere differ in both
+    assert [w["what"] for w in warnings_of(shifted, True, from_anywhere=True)] == said[
+        2:
+    ]  # photos from anywhere differ in both
 
 
 def test_sharpness_is_of_the_photo_not_of_what_it_shows():
@@ -231,7 +287,11 @@ def test_exif_is_read_and_damage_is_survived(tmp_path):
     exif.get_ifd(0x8769).update({0x829A: 0.01, 0x829D: 4.0, 0x8827: 400, 0x9209: 1})
     image.save(tmp_path / "a.jpg", exif=exif)
     found = read_exif(tmp_path / "a.jpg")
-    assert found.camera == "Maker Model 1" and found.flash is True and found.ev == pytest.approx(np.log2(0.01 * 400 / 16))
+    assert (
+        found.camera == "Maker Model 1"
+        and found.flash is True
+        and found.ev == pytest.approx(np.log2(0.01 * 400 / 16))
+    )
     data = bytearray((tmp_path / "a.jpg").read_bytes())
     at = data.index(b"Exif") + 14
     data[at : at + 40] = b"\xff" * 40
@@ -248,39 +308,64 @@ def test_epipolar_distances():
 
 
 def write(folder, n=24, turned=0.0, side=256):
-    """A folder with transforms.json whose poses are `turned` (radians, about the camera's axis of sight) against the photos."""
+    """A folder with transforms.json whose poses are `turned` (radians, about the camera's axis of
+    sight) against the photos."""
     (folder / "images").mkdir(parents=True)
     frames = []
     for i in range(n):
-        camera = Camera(side, side, 1.3 * side, 1.3 * side, side / 2, side / 2, look_at(eye(i, n), np.zeros(3)))
+        camera = Camera(
+            side, side, 1.3 * side, 1.3 * side, side / 2, side / 2, look_at(eye(i, n), np.zeros(3))
+        )
         rgb = ball_photo(camera, fixed).rgb
-        Image.fromarray((np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8)).save(folder / f"images/{i:02d}.png")
+        Image.fromarray((np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8)).save(
+            folder / f"images/{i:02d}.png"
+        )
         c, s = np.cos(turned), np.sin(turned)
-        pose = camera.world_from_camera @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-        frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": world_from_gl_camera(pose).tolist()})
-    intrinsics = {"w": side, "h": side, "fl_x": 1.3 * side, "fl_y": 1.3 * side, "cx": side / 2, "cy": side / 2}
+        pose = camera.world_from_camera @ np.array(
+            [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]
+        )
+        frames.append(
+            {
+                "file_path": f"images/{i:02d}.png",
+                "transform_matrix": world_from_gl_camera(pose).tolist(),
+            }
+        )
+    intrinsics = {
+        "w": side,
+        "h": side,
+        "fl_x": 1.3 * side,
+        "fl_y": 1.3 * side,
+        "cx": side / 2,
+        "cy": side / 2,
+    }
     (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
     return folder
 
 
 def test_cameras_that_do_not_belong_to_the_photos(tmp_path):
-    from relit.plan import Job
+    from relit.job import Job
 
     right = inspect(write(tmp_path / "right"), Job(masks="none"))
     assert right["epipolar"]["share"] > 0.9 and right["epipolar"]["median"] < 0.5
     assert not [w for w in right["warnings"] if "epipolar" in w["what"]]
     wrong = inspect(write(tmp_path / "wrong", turned=0.6), Job(masks="none"))
-    assert wrong["epipolar"]["share"] < 0.5 and [w for w in wrong["warnings"] if "epipolar" in w["what"]]
+    assert wrong["epipolar"]["share"] < 0.5 and [
+        w for w in wrong["warnings"] if "epipolar" in w["what"]
+    ]
 
 
 def test_photos_without_texture_are_not_matched(tmp_path):
-    looks = look_at_photos(capture(tmp_path, [lambda n, c: np.full((*n.shape[:-1], 1), 0.5)] * 4, mask=False))
+    looks = look_at_photos(
+        capture(tmp_path, [lambda n, c: np.full((*n.shape[:-1], 1), 0.5)] * 4, mask=False)
+    )
     flat = [type(x)(**{**x.__dict__, "rgb": np.full_like(x.rgb, 0.3)}) for x in looks]
     assert match(flat[0], flat[1]) is None
 
 
 def test_widest_gap():
-    ring = np.array([[np.cos(a), 0, np.sin(a)] for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)])
+    ring = np.array(
+        [[np.cos(a), 0, np.sin(a)] for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)]
+    )
     assert widest_gap(ring) == pytest.approx(90, abs=5)  # nobody looked from above
     assert widest_gap(ring[:6]) > 80 > 60 > widest_gap(np.concatenate([ring, ring[:, [1, 0, 2]]]))
 
@@ -293,8 +378,14 @@ def test_the_page(tmp_path, capsys):
     assert "<co>" not in page and "&lt;co&gt;" in page
     assert "<script" not in page and "http" not in page.replace("http://www.w3.org/2000/svg", "")
     assert page.count("<figure>") >= 6 and "<svg" in page and found["light_regime"]["guess"] in page
-    assert found["looked_at"] == 6 and len(found["drift"]["photos"]) == 6 and found["coverage"]["fill"] > 0.3
-    assert cli.main(["inspect", str(folder), "--html", str(tmp_path / "p.html")]) == 3  # nothing is overwritten
+    assert (
+        found["looked_at"] == 6
+        and len(found["drift"]["photos"]) == 6
+        and found["coverage"]["fill"] > 0.3
+    )
+    assert (
+        cli.main(["inspect", str(folder), "--html", str(tmp_path / "p.html")]) == 3
+    )  # nothing is overwritten
 
 
 def planned(capsys, folder, *flags):
@@ -305,34 +396,57 @@ def planned(capsys, folder, *flags):
 
 
 def test_an_input_is_planned_as_what_it_is_said_to_be(tmp_path, capsys):
-    """Photos with cameras in files that tell no kind: stages, cost, and the light that is expected are those of --capture."""
+    """Photos with cameras in files that tell no kind: stages, cost, and the light that is expected
+    are those of --capture."""
     folder = write(tmp_path / "photos", n=6, side=96)
     plain = planned(capsys, folder, "--masks", "none")
     flash = planned(capsys, folder, "--masks", "none", "--capture", "flash")
-    assert (plain["capture"], flash["capture"]) == ("multiview", "flash") and "flash" in flash["light"]
+    assert (plain["capture"], flash["capture"]) == ("multiview", "flash") and "flash" in flash[
+        "light"
+    ]
     assert flash["estimate"]["seconds"] < plain["estimate"]["seconds"]
     (folder / "transforms.json").unlink()
     many = planned(capsys, folder, "--masks", "none", "--capture", "collection", "--max-side", "64")
-    assert many["capture"] == "collection" and many["stages"][0] == "links" and many["sizes"] == [[64, 64]]
+    assert (
+        many["capture"] == "collection"
+        and many["stages"][0] == "links"
+        and many["sizes"] == [[64, 64]]
+    )
     assert planned(capsys, folder, "--masks", "none")["stages"][0] == "cameras"
-    kinds = [w["what"] for w in flash["warnings"] if "a flash capture expects flash light" in w["what"]]
-    assert bool(kinds) == (flash["light_regime"]["guess"] != "flash" and flash["light_regime"]["confidence"] >= 0.25)
+    kinds = [
+        w["what"] for w in flash["warnings"] if "a flash capture expects flash light" in w["what"]
+    ]
+    assert bool(kinds) == (
+        flash["light_regime"]["guess"] != "flash" and flash["light_regime"]["confidence"] >= 0.25
+    )
 
 
 def test_a_photo_of_duplicates_is_planned_by_its_segmenter(tmp_path, capsys, monkeypatch):
     """--masks segment:FILE.onnx and --focal reach the reader, as in `relit reconstruct`."""
-    import relit.capture.sfd as sfd
+    import relit.capture.readers.sfd as sfd
 
     labels = np.zeros((96, 160), np.int32)
     for k in range(3):
         cv2.circle(labels, (30 + 48 * k, 48), 18, k + 1, -1)
     monkeypatch.setattr(sfd, "Network", lambda path: path)
     monkeypatch.setattr(sfd, "found_instances", lambda network, rgb: labels)
-    cv2.imwrite(str(tmp_path / "pile.png"), np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8))
+    cv2.imwrite(
+        str(tmp_path / "pile.png"),
+        np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8),
+    )
     words = ["--capture", "duplicates", "--masks", "segment:mine.onnx"]
     found = planned(capsys, tmp_path / "pile.png", *words, "--focal", "200")
-    assert found["capture"] == "duplicates" and found["stages"][0] == "poses" and "several identical objects" in found["light"]
-    assert any("3 objects found by mine.onnx" in n for n in found["notes"]) and not any("focal length" in n for n in found["notes"])
-    assert any("focal length is not known" in n for n in planned(capsys, tmp_path / "pile.png", *words)["notes"])
+    assert (
+        found["capture"] == "duplicates"
+        and found["stages"][0] == "poses"
+        and "several identical objects" in found["light"]
+    )
+    assert any("3 objects found by mine.onnx" in n for n in found["notes"]) and not any(
+        "focal length" in n for n in found["notes"]
+    )
+    assert any(
+        "focal length is not known" in n
+        for n in planned(capsys, tmp_path / "pile.png", *words)["notes"]
+    )
     code = cli.main(["inspect", str(tmp_path / "pile.png"), "--capture", "duplicates"])
     assert code == 3 and "no labels were found" in capsys.readouterr().err

@@ -1,4 +1,5 @@
-"""The main job around the fit: resuming, repeating, refusing; the fit itself is replaced by one that hands the truth back."""
+"""The main job around the fit: resuming, repeating, refusing; the fit itself is replaced by one
+that hands the truth back."""
 
 from __future__ import annotations
 
@@ -13,14 +14,14 @@ import pytest
 from PIL import Image
 from test_faults import picture, write_capture
 
-from relit import cli
 from relit.asset.asset import load_asset
-from relit.capture.procedural import pawn, studio
+from relit.cli import main as cli
 from relit.errors import UserError
-from relit.evaluate import report
 from relit.files import parse_toml
-from relit.plan import Job, check_memory, estimate, open_input
+from relit.job import Job, check_memory, estimate, open_input
+from relit.report import page as report
 from relit.scene import Asset
+from relit.synthesize.procedural import pawn, studio
 
 CALLS: list[tuple] = []
 
@@ -28,7 +29,7 @@ CALLS: list[tuple] = []
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """A fit of three steps that checkpoints each, and a small report."""
-    import relit.fit.multiview as multiview
+    import relit.fit.multiview.recipe as multiview
 
     for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1}.items():
         monkeypatch.setattr(report, name, value)
@@ -45,7 +46,9 @@ def quick(monkeypatch):
                     stage.save("state", i=i + 1)
                     if STOP and i == 1:
                         raise STOP.pop()
-        return Asset(mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos))
+        return Asset(
+            mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos)
+        )
 
     monkeypatch.setattr(multiview, "reconstruct", fit)
 
@@ -73,18 +76,28 @@ def test_a_stopped_job_resumes_and_a_finished_one_is_left(capsys, tmp_path, capt
     code, out, _ = relit(capsys, *command)
     assert code == 0 and out.strip() == str(tmp_path / "run/asset/object.glb")
     assert CALLS == [("fit", 0, 6, 3), ("fit", 2, 6, 3)]
-    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*") if p.is_file() and p.name not in ("lock", "log.txt")}
+    before = {
+        p: p.stat().st_mtime_ns
+        for p in (tmp_path / "run").rglob("*")
+        if p.is_file() and p.name not in ("lock", "log.txt")
+    }
     code, _, err = relit(capsys, *command)
     assert code == 0 and "this run is complete" in err and len(CALLS) == 2
     assert before == {p: p.stat().st_mtime_ns for p in before}
     (tmp_path / "run/report.html").unlink()
-    assert relit(capsys, *command)[0] == 0 and (tmp_path / "run/report.html").exists() and len(CALLS) == 2
+    assert (
+        relit(capsys, *command)[0] == 0
+        and (tmp_path / "run/report.html").exists()
+        and len(CALLS) == 2
+    )
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_inside_a_native_loop_is_still_a_stop(capsys, tmp_path, capture, monkeypatch, number, code):
+def test_a_signal_inside_a_native_loop_is_still_a_stop(
+    capsys, tmp_path, capture, monkeypatch, number, code
+):
     """Dr.Jit's loops raise RuntimeError from whatever passes through them."""
-    import relit.fit.multiview as multiview
+    import relit.fit.multiview.recipe as multiview
 
     def fit(capture, run, options, seed):
         with run.stage("volume", steps=3) as stage:
@@ -100,26 +113,78 @@ def test_a_signal_inside_a_native_loop_is_still_a_stop(capsys, tmp_path, capture
     got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
     assert got == code and "goes on from the checkpoint" in err and "fault of Relit" not in err
     assert before == [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
-    assert relit(capsys, "inspect", tmp_path / "nowhere")[0] == 3  # the stop is forgotten by the next command
+    assert (
+        relit(capsys, "inspect", tmp_path / "nowhere")[0] == 3
+    )  # the stop is forgotten by the next command
 
 
 def test_the_asset_says_how_it_was_made_and_holds_no_path(capsys, tmp_path, capture):
     assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--seed", "5")[0] == 0
     meta = load_asset(tmp_path / "run").meta
-    assert meta["capture"] == "multiview" and meta["seed"] == 5 and meta["quality"] == "standard" and meta["device"] in ("cpu", "cuda")
-    assert meta["stages"]["volume"]["peak_memory"] > 1e7 and "images/p0.png" in meta["inputs"] and "mitsuba" in meta["versions"]
+    assert (
+        meta["capture"] == "multiview"
+        and meta["seed"] == 5
+        and meta["quality"] == "standard"
+        and meta["device"] in ("cpu", "cuda")
+    )
+    assert (
+        meta["stages"]["volume"]["peak_memory"] > 1e7
+        and "images/p0.png" in meta["inputs"]
+        and "mitsuba" in meta["versions"]
+    )
     for path in (tmp_path / "run").rglob("*"):
         if path.is_file() and path.suffix in (".toml", ".json", ".jsonl", ".html"):
             assert str(tmp_path) not in path.read_text(), path
     config = parse_toml((tmp_path / "run/config.toml").read_text())
-    assert config["input"] == "photos" and config["seed"] == 5 and isinstance(config["settings"], dict)
+    assert (
+        config["input"] == "photos" and config["seed"] == 5 and isinstance(config["settings"], dict)
+    )
 
 
 def test_a_runs_config_repeats_it(capsys, tmp_path, capture):
-    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "a", "--quality", "draft", "--max-side", "40", "--seed", "7")[0] == 0
-    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "b", "--config", tmp_path / "a/config.toml")[0] == 0
+    assert (
+        relit(
+            capsys,
+            "reconstruct",
+            capture,
+            "-o",
+            tmp_path / "a",
+            "--quality",
+            "draft",
+            "--max-side",
+            "40",
+            "--seed",
+            "7",
+        )[0]
+        == 0
+    )
+    assert (
+        relit(
+            capsys,
+            "reconstruct",
+            capture,
+            "-o",
+            tmp_path / "b",
+            "--config",
+            tmp_path / "a/config.toml",
+        )[0]
+        == 0
+    )
     assert (tmp_path / "a/config.toml").read_text() == (tmp_path / "b/config.toml").read_text()
-    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "c", "--config", tmp_path / "a/config.toml", "--seed", "8")[0] == 0
+    assert (
+        relit(
+            capsys,
+            "reconstruct",
+            capture,
+            "-o",
+            tmp_path / "c",
+            "--config",
+            tmp_path / "a/config.toml",
+            "--seed",
+            "8",
+        )[0]
+        == 0
+    )
     assert parse_toml((tmp_path / "c/config.toml").read_text())["seed"] == 8
 
 
@@ -132,21 +197,28 @@ def test_other_settings_and_replaced_photos_are_refused(capsys, tmp_path, captur
     code, _, err = relit(capsys, "reconstruct", capture, "-o", run, "--quality", "draft")
     assert code == 3 and "images/p2.png" in err and len(CALLS) == 1
     Image.fromarray(picture(2)).save(capture / "images/p2.png")
-    assert relit(capsys, "reconstruct", capture, "-o", run, "--quality", "high", "--overwrite")[0] == 0
+    assert (
+        relit(capsys, "reconstruct", capture, "-o", run, "--quality", "high", "--overwrite")[0] == 0
+    )
     assert len(CALLS) == 2
 
 
-def test_photos_whose_camera_is_not_found_are_no_changed_input(capsys, tmp_path, capture, monkeypatch):
-    import relit.reconstruct as job
+def test_photos_whose_camera_is_not_found_are_no_changed_input(
+    capsys, tmp_path, capture, monkeypatch
+):
+    import relit.reconstruction as job
 
-    monkeypatch.setattr(job, "with_cameras", lambda capture, *rest: replace(capture, photos=capture.photos[:-1]))
+    monkeypatch.setattr(
+        job, "with_cameras", lambda capture, *rest: replace(capture, photos=capture.photos[:-1])
+    )
     code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--device", "cpu")
     assert code == 0, err
     assert (tmp_path / "run" / "asset" / "object.glb").is_file()
 
 
 def test_a_focal_length_is_that_of_the_files(capsys, tmp_path, capture, monkeypatch):
-    """--max-side shrinks the photos, each by a factor of its own, and the focal length in pixels with them."""
+    """--max-side shrinks the photos, each by a factor of its own, and the focal length in pixels
+    with them."""
     import relit.cameras.sfm as sfm
 
     def find(capture, *, focals, **rest):
@@ -160,7 +232,19 @@ def test_a_focal_length_is_that_of_the_files(capsys, tmp_path, capture, monkeypa
     last = sorted((capture / "images").iterdir())[-1]
     Image.fromarray(np.repeat(np.repeat(np.array(Image.open(last)), 2, 0), 2, 1)).save(last)
     for more in ((), ("--max-side", side // 2)):
-        assert relit(capsys, "reconstruct", capture, "-o", tmp_path / f"run{len(more)}", "--focal", "70", *more)[0] == 3
+        assert (
+            relit(
+                capsys,
+                "reconstruct",
+                capture,
+                "-o",
+                tmp_path / f"run{len(more)}",
+                "--focal",
+                "70",
+                *more,
+            )[0]
+            == 3
+        )
     assert CALLS == [(side, 70.0, 70.0, [count - 1, 1]), (side // 2, 35.0, 17.5, [count - 1, 1])]
 
 
@@ -182,44 +266,62 @@ def test_estimate_grows_with_photos_and_quality(capture, monkeypatch):
 
 
 def test_estimate_at_the_measured_capture_is_what_was_measured(capture):
-    from relit.plan import MEASURED, MEASURED_PHOTOS
+    from relit.job import MEASURED, MEASURED_PHOTOS
 
     opened = open_input(capture, Job())
     side = {"width": 400, "height": 400}
-    sixty = replace(opened, photos=tuple(replace(opened.photos[0], **side) for _ in range(MEASURED_PHOTOS)))
+    sixty = replace(
+        opened, photos=tuple(replace(opened.photos[0], **side) for _ in range(MEASURED_PHOTOS))
+    )
     for quality, (seconds, memory) in MEASURED.items():
         cost = estimate(sixty, Job(quality=quality))
-        assert (cost.seconds, cost.memory) == pytest.approx((seconds, memory), rel=0.1)  # draft shrinks them
-    assert estimate(replace(sixty, photos=sixty.photos * 2), Job()).seconds > MEASURED["standard"][0]
+        assert (cost.seconds, cost.memory) == pytest.approx(
+            (seconds, memory), rel=0.1
+        )  # draft shrinks them
+    assert (
+        estimate(replace(sixty, photos=sixty.photos * 2), Job()).seconds > MEASURED["standard"][0]
+    )
 
 
 def test_a_flash_capture_has_a_cost_of_its_own(capture):
     """120 photos of 400x400 at standard took 217 s and 2.4 GB; a draft 56 s (the cup)."""
     opened = open_input(capture, Job())
-    many = replace(opened, photos=tuple(replace(opened.photos[0], width=400, height=400) for _ in range(120)))
+    many = replace(
+        opened, photos=tuple(replace(opened.photos[0], width=400, height=400) for _ in range(120))
+    )
     cost = estimate(many, Job(), "flash")
     assert (cost.seconds, cost.memory) == pytest.approx((217.0, 2.4e9), rel=0.05)
     draft, high = (estimate(many, Job(quality=q), "flash") for q in ("draft", "high"))
-    assert draft.seconds == pytest.approx(56, rel=0.2) and draft.memory < cost.memory < high.memory and cost.seconds < high.seconds
+    assert (
+        draft.seconds == pytest.approx(56, rel=0.2)
+        and draft.memory < cost.memory < high.memory
+        and cost.seconds < high.seconds
+    )
 
 
 def test_more_identical_objects_cost_more(capture):
-    """Ten Spots took 398 s and 1.6 GB, thirty 653 s and 2.1 GB, sixty 962 s and 2.6 GB; other objects up to 590 s and 2 GB."""
+    """Ten Spots took 398 s and 1.6 GB, thirty 653 s and 2.1 GB, sixty 962 s and 2.6 GB; other
+    objects up to 590 s and 2 GB."""
     opened = open_input(capture, Job())
     photo = replace(opened, photos=(replace(opened.photos[0], width=1600, height=1600),))
-    ten, thirty, sixty = (estimate(replace(photo, objects=n), Job(), "duplicates") for n in (10, 30, 60))
+    ten, thirty, sixty = (
+        estimate(replace(photo, objects=n), Job(), "duplicates") for n in (10, 30, 60)
+    )
     assert 398 < ten.seconds < 653 < thirty.seconds < 962 < sixty.seconds < 1300
     assert 1.6e9 < ten.memory < 2.5e9 and 2.1e9 < thirty.memory < sixty.memory < 4e9
-    assert estimate(photo, Job(), "duplicates").seconds == ten.seconds  # of objects that are not known
+    assert (
+        estimate(photo, Job(), "duplicates").seconds == ten.seconds
+    )  # of objects that are not known
 
 
 def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, monkeypatch):
-    """`--capture auto` takes the kind that the reader told, and says so when there is no recipe for it."""
+    """`--capture auto` takes the kind that the reader told, and says so when there is no recipe for
+    it."""
     import sys
     import types
     from dataclasses import dataclass, replace
 
-    from relit import plan
+    from relit import job as plan
 
     @dataclass(frozen=True)
     class Options:
@@ -228,10 +330,17 @@ def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, m
     def fit(capture, run, options, seed):
         CALLS.append((options.steps, capture.has_cameras))
         mesh, material = pawn(10, 14, 16)
-        return Asset(mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos))
+        return Asset(
+            mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos)
+        )
 
     recipe = types.ModuleType("stand_in_recipe")
-    recipe.options_for, recipe.reconstruct, recipe.LIGHT, recipe.STAGES = (lambda quality: Options()), fit, "a lamp", ("one",)
+    recipe.options_for, recipe.reconstruct, recipe.LIGHT, recipe.STAGES = (
+        (lambda quality: Options()),
+        fit,
+        "a lamp",
+        ("one",),
+    )
     recipe.LEAST_PHOTOS, recipe.COST = 1, {"standard": (7.0, 1.0e9)}
     monkeypatch.setitem(sys.modules, "stand_in_recipe", recipe)
     opened = plan.open_input(capture, Job())
@@ -242,9 +351,24 @@ def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, m
     monkeypatch.setitem(plan.RECIPES, "flash", "stand_in_recipe")
     assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--set", "steps=5")[0] == 0
     assert CALLS == [(5, True)] and load_asset(tmp_path / "run").meta["capture"] == "flash"
-    code, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "other", "--set", "rays=5")
+    code, _, err = relit(
+        capsys, "reconstruct", capture, "-o", tmp_path / "other", "--set", "rays=5"
+    )
     assert code == 2 and "known keys: steps" in err
-    assert relit(capsys, "reconstruct", capture, "-o", tmp_path / "m", "--capture", "multiview", "--quality", "draft")[0] == 0
+    assert (
+        relit(
+            capsys,
+            "reconstruct",
+            capture,
+            "-o",
+            tmp_path / "m",
+            "--capture",
+            "multiview",
+            "--quality",
+            "draft",
+        )[0]
+        == 0
+    )
     assert CALLS[-1][0] == "fit"
 
 
@@ -252,7 +376,11 @@ def test_inspect_changes_nothing(capsys, capture):
     before = sorted(capture.rglob("*"))
     code, out, _ = relit(capsys, "inspect", capture, "--json", "--quality", "high")
     found = json.loads(out)
-    assert code == 0 and found["stages"] == ["volume", "mesh", "surface", "asset", "report"] and found["estimate"]["quality"] == "high"
+    assert (
+        code == 0
+        and found["stages"] == ["volume", "mesh", "surface", "asset", "report"]
+        and found["estimate"]["quality"] == "high"
+    )
     assert before == sorted(capture.rglob("*"))
 
 

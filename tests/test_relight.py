@@ -24,7 +24,11 @@ def asset() -> Asset:
     s = trimesh.creation.icosphere(2)
     mesh = Mesh(s.vertices.astype(np.float32), s.faces.astype(np.int32))
     mesh = replace(mesh, normals=vertex_normals(mesh))
-    material = Material(np.full((1, 1, 3), 0.6, np.float32), np.full((1, 1), 0.8, np.float32), np.zeros((1, 1), np.float32))
+    material = Material(
+        np.full((1, 1, 3), 0.6, np.float32),
+        np.full((1, 1), 0.8, np.float32),
+        np.zeros((1, 1), np.float32),
+    )
     world = similarity(TURN, [5, 6, 7], 0.1)
     pose = np.eye(4)  # looks along world +Y, world +Z is up in the picture
     pose[:3, :3] = np.stack([[1, 0, 0], [0, 0, -1], [0, 1, 0]], 1)
@@ -75,7 +79,8 @@ def test_the_recovered_light_stands_where_it_was(run, tmp_path):
 
 
 def test_rotation_turns_the_light_about_the_objects_up(run, tmp_path):
-    """+90 degrees carry a light from the asset's +Z to its +X; the camera looks along the asset's -Z."""
+    """+90 degrees carry a light from the asset's +Z to its +X; the camera looks along the asset's
+    -Z."""
     light = np.zeros((16, 32, 3), np.float32)
     light[:, 14:18] = 1  # from +Z
     write_linear(tmp_path / "front.exr", light)
@@ -144,7 +149,9 @@ def test_video(run, from_above, tmp_path, monkeypatch, with_ffmpeg):
         monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     seen = []
     out = tmp_path / "turn.mp4"
-    assert relight(run, from_above, out, cameras="orbit:3", size=32, spp=2, progress=lambda *a: seen.append(a)) == [out]
+    assert relight(
+        run, from_above, out, cameras="orbit:3", size=32, spp=2, progress=lambda *a: seen.append(a)
+    ) == [out]
     assert seen == [(2, 6), (4, 6), (6, 6)]  # of three pictures with two samples each
     video = cv2.VideoCapture(str(out))
     frames = []

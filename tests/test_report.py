@@ -13,20 +13,27 @@ import pytest
 from PIL import Image
 
 from relit.asset.asset import save_asset
-from relit.cameras.se3 import look_at
-from relit.capture.procedural import evening, pawn, studio
 from relit.conventions import environment_directions, environment_solid_angles
-from relit.evaluate import report
-from relit.evaluate.curves import ball_of, bars, camera_plot, curve
+from relit.geometry.se3 import look_at
+from relit.report import page as report
+from relit.report.curves import ball_of, bars, camera_plot, curve
 from relit.run import Run
 from relit.scene import Asset, Camera, Capture, Photo, Pixels
+from relit.synthesize.procedural import evening, pawn, studio
 
 EVIL = "<script>alert(1)</script>.png"
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    for name, value in {"SIDE": 40, "STILLS": 3, "SPP": 2, "SPP_COMPARED": 2, "VIEWS": 2, "HELD_OUT": 1}.items():
+    for name, value in {
+        "SIDE": 40,
+        "STILLS": 3,
+        "SPP": 2,
+        "SPP_COMPARED": 2,
+        "VIEWS": 2,
+        "HELD_OUT": 1,
+    }.items():
         monkeypatch.setattr(report, name, value)
 
 
@@ -103,7 +110,14 @@ def test_the_report_stands_alone_and_shows_everything(folder, asset):
         assert picture.ndim == 3 and picture.std() > 0
     assert len(reader.sources) >= 3 + 8 + 2 + 4 + 3
     said = " ".join(reader.text)
-    names = ("volume pass", "2 photos were <b>blurred</b>", "seed 3", "object.glb", "(held out)", EVIL)
+    names = (
+        "volume pass",
+        "2 photos were <b>blurred</b>",
+        "seed 3",
+        "object.glb",
+        "(held out)",
+        EVIL,
+    )
     for expected in ("31.25", "of <sRGB> pictures", *names):
         assert expected in said
     assert "Losses" in reader.headings and "Another light" in reader.headings
@@ -120,7 +134,7 @@ def test_the_report_says_what_is_missing(folder):
 def test_comparison_measures_where_the_object_is_drawn(asset, monkeypatch):
     """Photos that are the report's own renders agree; grey ones do not."""
     monkeypatch.setattr(report, "SPP_COMPARED", 32)
-    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.reference.mitsuba_scene import build_scene, render
 
     scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
     camera = asset.cameras[1][1]
@@ -134,7 +148,9 @@ def test_comparison_measures_where_the_object_is_drawn(asset, monkeypatch):
 
 
 def test_curves():
-    assert "(log)" in curve("a", [(1, 100.0), (2, 1.0)]) and "(log)" not in curve("a", [(1, 1.0), (2, -1.0)])
+    assert "(log)" in curve("a", [(1, 100.0), (2, 1.0)]) and "(log)" not in curve(
+        "a", [(1, 1.0), (2, -1.0)]
+    )
     assert curve("flat", [(1, 2.0), (2, 2.0)]).count("nan") == 0
     assert "&lt;" in curve("<", [(1, 1), (2, 2)]) and bars([]) == ""
     assert bars([("a", 0.0)]).count("<rect") == 1
@@ -142,8 +158,12 @@ def test_curves():
 
 def test_camera_plot_shows_every_camera_on_both_sides(asset):
     ball = ball_of(asset)
-    vertices = asset.mesh.vertices @ asset.world_from_asset[:3, :3].T + asset.world_from_asset[:3, 3]
-    assert np.linalg.norm(vertices @ ball[:3, :3].T + ball[:3, 3], axis=1).max() == pytest.approx(1, abs=1e-5)
+    vertices = (
+        asset.mesh.vertices @ asset.world_from_asset[:3, :3].T + asset.world_from_asset[:3, 3]
+    )
+    assert np.linalg.norm(vertices @ ball[:3, :3].T + ball[:3, 3], axis=1).max() == pytest.approx(
+        1, abs=1e-5
+    )
     plot = camera_plot([c for _, c in asset.cameras], ball)
     assert plot.count("<line") == 2 * len(asset.cameras) and plot.count("<svg") == 1
     assert camera_plot([], ball) == ""
@@ -156,12 +176,16 @@ def test_pawn_is_closed_smooth_and_in_range():
     import trimesh
 
     mesh, material = pawn(rows=24, columns=32, texture=64)
-    welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True, merge_tex=True, merge_norm=True)
+    welded = trimesh.Trimesh(
+        mesh.vertices, mesh.faces, process=True, merge_tex=True, merge_norm=True
+    )
     assert welded.is_watertight and welded.volume > 0.4
     corners = mesh.vertices[mesh.faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.linalg.norm(flat, axis=1) > 0).all()
-    assert (np.einsum("ij,ij->i", flat, mesh.normals[mesh.faces].mean(1)) > 0).all()  # counter-clockwise from outside
+    assert (
+        np.einsum("ij,ij->i", flat, mesh.normals[mesh.faces].mean(1)) > 0
+    ).all()  # counter-clockwise from outside
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
     assert 0 <= mesh.uvs.min() and mesh.uvs.max() <= 1
     for array in (material.base_color, material.roughness, material.metallic):
@@ -173,7 +197,9 @@ def test_lights_are_positive_bright_and_coloured():
     for light in (studio(64), evening(64)):
         assert light.shape == (64, 128, 3) and light.dtype == np.float32 and light.min() >= 0
         assert light.max() > 20 * light.mean()
-    brightest = environment_directions(64, 128)[np.unravel_index(studio(64).sum(-1).argmax(), (64, 128))]
+    brightest = environment_directions(64, 128)[
+        np.unravel_index(studio(64).sum(-1).argmax(), (64, 128))
+    ]
     assert brightest @ np.array([0.55, 0.60, 0.58]) > 0.97
     mean = np.einsum("hwc,hw->c", studio(64), environment_solid_angles(64, 128)) / (4 * np.pi)
     assert (mean > 0.2).all() and (mean < 3).all()

@@ -1,4 +1,5 @@
-"""A long job behaves like one: it resumes, holds its folder, survives a kill, and overwrites nothing."""
+"""A long job behaves like one: it resumes, holds its folder, survives a kill, and overwrites
+nothing."""
 
 from __future__ import annotations
 
@@ -15,11 +16,23 @@ import numpy as np
 import pytest
 
 from relit.errors import EXIT_ENVIRONMENT, UserError
-from relit.files import digests, disk_error, load_arrays, parse_toml, save_arrays, toml_text, write_text
+from relit.files import (
+    digests,
+    disk_error,
+    load_arrays,
+    parse_toml,
+    save_arrays,
+    toml_text,
+    write_text,
+)
 from relit.log import Log, MemoryWatch, Progress, peak_memory, readable_bytes, readable_seconds
 from relit.run import Run, read_metrics
 
-CONFIG = {"capture": "multiview", "seed": 0, "settings": {"steps": 3, "rate": 0.5, "fast": True, "name": 'a "b"\n\\c'}}
+CONFIG = {
+    "capture": "multiview",
+    "seed": 0,
+    "settings": {"steps": 3, "rate": 0.5, "fast": True, "name": 'a "b"\n\\c'},
+}
 
 JOB = """
 import sys, time
@@ -47,7 +60,12 @@ with termination(), Run.open(sys.argv[1], {"seed": 0}) as r:
 
 
 def start(folder):
-    return subprocess.Popen([sys.executable, "-c", JOB, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", JOB, str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
 
 
 def wait_for(path, process):
@@ -101,7 +119,11 @@ def test_other_settings_are_refused_by_name(tmp_path):
     with pytest.raises(UserError, match="other settings") as caught:
         Run.open(tmp_path, {**CONFIG, "seed": 1, "settings": {**CONFIG["settings"], "steps": 4}})
     text = str(caught.value)
-    assert "seed was 0, is now 1" in text and "settings.steps was 3, is now 4" in text and "--overwrite" in text
+    assert (
+        "seed was 0, is now 1" in text
+        and "settings.steps was 3, is now 4" in text
+        and "--overwrite" in text
+    )
     assert "rate" not in text
     assert parse_toml((tmp_path / "config.toml").read_text()) == CONFIG
 
@@ -154,10 +176,16 @@ def test_stage_records_time_memory_and_losses(tmp_path):
                 stage.step(i, loss=lambda i=i: calls.append(i) or 1.0 / i, rate=0.1)
         assert run.done("fit") and not run.done("other")
         (record,) = run.stages()
-        assert record["title"] == "volume pass" and record["seconds"] < 10 and record["peak_memory"] > 1e6
+        assert (
+            record["title"] == "volume pass"
+            and record["seconds"] < 10
+            and record["peak_memory"] > 1e6
+        )
         assert len(calls) < 20  # callables are evaluated only when a line is written
         last = run.metrics()[-1]
-        assert last["stage"] == "fit" and last["step"] == 1000 and last["loss"] == pytest.approx(0.001)
+        assert (
+            last["stage"] == "fit" and last["step"] == 1000 and last["loss"] == pytest.approx(0.001)
+        )
 
 
 def test_a_failing_stage_is_not_done(tmp_path):
@@ -209,7 +237,9 @@ def test_checkpoint_is_due_after_its_interval(tmp_path, monkeypatch):
 def test_metrics_survive_a_torn_line_and_repeated_steps(tmp_path):
     Run.open(tmp_path, CONFIG).close()
     rows = [{"stage": "a", "step": s, "loss": s} for s in (1, 2, 3)]
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows) + '{"stage": "a", "st')
+    (tmp_path / "metrics.jsonl").write_text(
+        "".join(json.dumps(r) + "\n" for r in rows) + '{"stage": "a", "st'
+    )
     with Run.open(tmp_path, CONFIG) as run, run.stage("a", steps=3) as stage:
         stage.step(2, loss=9.0)
     got = read_metrics(tmp_path)
@@ -228,7 +258,9 @@ def test_a_full_disk_is_an_environment_error(tmp_path, monkeypatch):
         stage.save("state", x=2)
     monkeypatch.undo()
     assert caught.value.code == EXIT_ENVIRONMENT and str(tmp_path) in caught.value.fix
-    assert int(load_arrays(tmp_path / "stages/fit/state.npz")["x"]) == 1  # the old checkpoint is whole
+    assert (
+        int(load_arrays(tmp_path / "stages/fit/state.npz")["x"]) == 1
+    )  # the old checkpoint is whole
     assert not list(tmp_path.rglob("*.part"))
     run.close()
     assert disk_error(OSError(errno.ENOENT, "no"), tmp_path) is None
@@ -271,7 +303,9 @@ def test_progress_redraws_on_a_terminal_and_prints_plain_lines_elsewhere(monkeyp
             assert text.count("\r") > 50 and "\n" not in text
         else:
             assert "\r" not in text and text.count("\n") == 2
-            assert text.splitlines()[-1] == "volume pass  202/400  50 %  10.0/s  20 s left  loss 0.5"
+            assert (
+                text.splitlines()[-1] == "volume pass  202/400  50 %  10.0/s  20 s left  loss 0.5"
+            )
 
 
 def test_memory_watch_sees_a_stage_below_the_maximum():

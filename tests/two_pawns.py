@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from relit.capture.procedural import pawn
 from relit.conventions import similarity
 from relit.scene import Ground
+from relit.synthesize.procedural import pawn
 
 
 def two_pawns():

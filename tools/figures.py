@@ -1,4 +1,5 @@
-"""Writes docs/figures.md: what each figure of `relit evaluate` and of benchmarks/RESULTS.md means, from the definitions in the code.
+"""Writes docs/figures.md: what each figure of `relit evaluate` and of benchmarks/RESULTS.md means,
+from the definitions in the code.
 
 .venv/bin/python tools/figures.py
 """
@@ -42,11 +43,16 @@ TABLE = "\n| figure | unit | definition |\n|---|---|---|\n"
 
 
 def rows(definitions: dict[str, tuple[str, str]]) -> str:
-    return "".join(f"| `{name}` | {unit or '-'} | {text[0].upper()}{text[1:]} |\n" for name, (unit, text) in definitions.items())
+    return "".join(
+        f"| `{name}` | {unit or '-'} | {text[0].upper()}{text[1:]} |\n"
+        for name, (unit, text) in definitions.items()
+    )
 
 
 def page() -> str:
-    return HEAD + "\n".join((f"## {kind}\n" if kind else "") + TABLE + rows(some) for kind, some in KINDS.items())
+    return HEAD + "\n".join(
+        (f"## {kind}\n" if kind else "") + TABLE + rows(some) for kind, some in KINDS.items()
+    )
 
 
 if __name__ == "__main__":

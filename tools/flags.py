@@ -11,7 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "src"))
 
-from relit.verbs import VERBS, parser_for  # noqa: E402
+from relit.cli.verbs import VERBS, parser_for  # noqa: E402
 
 HEAD = """# Every flag
 
@@ -20,9 +20,17 @@ Written by `tools/flags.py` from the parsers. `relit VERB --help` says the same.
 
 
 def row(action) -> str:
-    name = ", ".join(f"`{o}`" for o in action.option_strings) or f"`{action.metavar or action.dest}`"
-    value = "" if action.nargs == 0 or not action.option_strings else f" {action.metavar or ''}".rstrip()
-    choices = "" if action.choices is None else " (" + ", ".join(str(c) for c in action.choices) + ")"
+    name = (
+        ", ".join(f"`{o}`" for o in action.option_strings) or f"`{action.metavar or action.dest}`"
+    )
+    value = (
+        ""
+        if action.nargs == 0 or not action.option_strings
+        else f" {action.metavar or ''}".rstrip()
+    )
+    choices = (
+        "" if action.choices is None else " (" + ", ".join(str(c) for c in action.choices) + ")"
+    )
     return f"| {name}{value} | {(action.help or '') + choices} |".replace("<", "&lt;")
 
 
@@ -39,7 +47,11 @@ def page() -> str:
     for verb, spec in VERBS.items():
         rows = {kind: rows_of(verb, kind) for kind in (list(spec.kinds) or [None])}
         common = [r for r in next(iter(rows.values())) if all(r in some for some in rows.values())]
-        parts.append(table(f"## relit {verb}", f"\n{spec.summary[0].upper()}{spec.summary[1:]}.\n", rows=common))
+        parts.append(
+            table(
+                f"## relit {verb}", f"\n{spec.summary[0].upper()}{spec.summary[1:]}.\n", rows=common
+            )
+        )
         for kind, all_rows in rows.items():
             own = [r for r in all_rows if r not in common]
             if kind and own:

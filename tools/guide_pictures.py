@@ -20,11 +20,17 @@ from relit.device import use_device  # noqa: E402
 
 use_device("cpu")
 
-from relit.cameras.se3 import exp_so3, look_at  # noqa: E402
-from relit.capture.procedural import evening, pawn, studio  # noqa: E402
-from relit.conventions import direction_from_uv, environment_directions, environment_solid_angles, srgb_from_linear, uv_from_direction  # noqa: E402
-from relit.rendering.mitsuba_scene import build_scene, render  # noqa: E402
+from relit.conventions import (  # noqa: E402
+    direction_from_uv,
+    environment_directions,
+    environment_solid_angles,
+    srgb_from_linear,
+    uv_from_direction,
+)
+from relit.geometry.se3 import exp_so3, look_at  # noqa: E402
+from relit.reference.mitsuba_scene import build_scene, render  # noqa: E402
 from relit.scene import Camera, Mesh  # noqa: E402
+from relit.synthesize.procedural import evening, pawn, studio  # noqa: E402
 
 SIDE, SPP = 150, 48
 MIDDLE = np.array([0.0, 0.8, 0.0])
@@ -39,20 +45,30 @@ def camera(angle, height=1.6, distance=3.4, zoom=1.7, aim=MIDDLE):
 def lobe(direction, strength, width=400.0, around=0.0):
     d = environment_directions(32, 64)
     direction = np.asarray(direction, float) / np.linalg.norm(direction)
-    return (around + strength * np.exp(width * (d @ direction - 1))[..., None] * np.ones(3)).astype(np.float32)
+    return (around + strength * np.exp(width * (d @ direction - 1))[..., None] * np.ones(3)).astype(
+        np.float32
+    )
 
 
 def shot(light, view, mesh=MESH, backdrop=0.12, gain=1.0):
     """(SIDE, SIDE, 3) sRGB in [0, 1]."""
     scene = build_scene(mesh, PAINT, np.eye(4), light)
     picture = render(scene, view, spp=SPP) * gain
-    return np.clip(srgb_from_linear(picture[..., :3] + (1 - np.clip(picture[..., 3:] / gain, 0, 1)) * backdrop), 0, 1)
+    return np.clip(
+        srgb_from_linear(
+            picture[..., :3] + (1 - np.clip(picture[..., 3:] / gain, 0, 1)) * backdrop
+        ),
+        0,
+        1,
+    )
 
 
 def flash(view):
     towards = view.centre - MIDDLE
     light = lobe(towards, 1.0, 600.0)
-    return light * np.float32(2.4 / (light[..., 0] * environment_solid_angles(*light.shape[:2])).sum())
+    return light * np.float32(
+        2.4 / (light[..., 0] * environment_solid_angles(*light.shape[:2])).sum()
+    )
 
 
 def pile(poses):
@@ -89,7 +105,12 @@ def multiview():
     light = studio(32)
     good = [
         (shot(light, camera(a, h)), c)
-        for a, h, c in ((0, 1.2, "sharp, large"), (0.6, 1.2, "a third further"), (1.2, 1.2, "and so on"), (0.6, 2.6, "from above"))
+        for a, h, c in (
+            (0, 1.2, "sharp, large"),
+            (0.6, 1.2, "a third further"),
+            (1.2, 1.2, "and so on"),
+            (0.6, 2.6, "from above"),
+        )
     ]
     still = shot(light, camera(0.3))
     kernel = np.zeros((11, 11))
@@ -117,11 +138,21 @@ def flashes():
 def duplicates():
     rng = np.random.default_rng(4)
     light, view = studio(32), camera(0.2, 4.2, 5.5, 1.1, np.array([0, 0.3, 0]))
-    turned = [(exp_so3(rng.normal(size=3) * 1.4), np.array([1.6 * x, 0.4, 1.6 * z])) for x in (-1, 0, 1) for z in (-1, 0, 1)]
+    turned = [
+        (exp_so3(rng.normal(size=3) * 1.4), np.array([1.6 * x, 0.4, 1.6 * z]))
+        for x in (-1, 0, 1)
+        for z in (-1, 0, 1)
+    ]
     alike = [(np.eye(3), np.array([1.5 * x, 0, 1.5 * z])) for x in (-1, 0, 1) for z in (-1, 0, 1)]
     heap = [(exp_so3(rng.normal(size=3) * 1.4), rng.normal(size=3) * 0.35) for _ in range(9)]
-    bad = [(shot(light, view, pile(alike)), "all from one side"), (shot(light, view, pile(heap)), "hidden by each other")]
-    sheet("duplicates", [(*GOOD, [(shot(light, view, pile(turned)), "turned every way")]), (*BAD, bad)])
+    bad = [
+        (shot(light, view, pile(alike)), "all from one side"),
+        (shot(light, view, pile(heap)), "hidden by each other"),
+    ]
+    sheet(
+        "duplicates",
+        [(*GOOD, [(shot(light, view, pile(turned)), "turned every way")]), (*BAD, bad)],
+    )
 
 
 def collection():
@@ -140,14 +171,23 @@ def collection():
     half[:, SIDE // 2 :] = 0.35
     tinted = dataclasses.replace(PAINT, base_color=PAINT.base_color[..., [2, 0, 1]])
     other = render(build_scene(MESH, tinted, np.eye(4), lights[0]), view, spp=SPP)
-    bad = [(half, "half hidden"), (np.clip(srgb_from_linear(other[..., :3] + (1 - other[..., 3:]) * 0.12), 0, 1), "another specimen")]
+    bad = [
+        (half, "half hidden"),
+        (
+            np.clip(srgb_from_linear(other[..., :3] + (1 - other[..., 3:]) * 0.12), 0, 1),
+            "another specimen",
+        ),
+    ]
     sheet("collection", [(*GOOD, good), (*BAD, bad)])
 
 
 def axes():
-    """A lat-long map with the six directions, and the object under a lamp at +X: what `docs/conventions.md` says in words."""
+    """A lat-long map with the six directions, and the object under a lamp at +X: what
+    `docs/conventions.md` says in words."""
     h, w = 150, 300
-    d = direction_from_uv(np.stack(np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h), -1))
+    d = direction_from_uv(
+        np.stack(np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h), -1)
+    )
     picture = Image.fromarray(((0.5 + 0.4 * d) * 255).astype(np.uint8))
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size=13)
     for name, direction in {
@@ -160,7 +200,9 @@ def axes():
     }.items():
         u, v = uv_from_direction(np.array(direction) / np.linalg.norm(direction))
         draw.text((u * w - 9, v * h - 8), name, fill=(0, 0, 0), font=font)
-    lit = Image.fromarray((shot(lobe([1, 0.2, 0], 40, 60, 0.06), camera(0.0, 1.2)) * 255).astype(np.uint8))
+    lit = Image.fromarray(
+        (shot(lobe([1, 0.2, 0], 40, 60, 0.06), camera(0.0, 1.2)) * 255).astype(np.uint8)
+    )
     out = Image.new("RGB", (w + SIDE + 12, SIDE + 22), (250, 250, 250))
     out.paste(picture, (0, 0))
     out.paste(lit, (w + 12, 0))

@@ -1,4 +1,5 @@
-"""Writes docs/licences.md: every dependency of Relit with its version and licence, read from what is installed.
+"""Writes docs/licences.md: every dependency of Relit with its version and licence, read from what
+is installed.
 
 .venv/bin/python tools/licences.py
 """
@@ -22,7 +23,8 @@ Written by `tools/licences.py` from what is installed. Relit itself: Apache-2.0 
 the page that the wheel carries has three.js and three-mesh-bvh built in, with their notices at its top.
 """
 
-# What their projects say, where the distribution does not or is an extra that need not be installed.
+# What their projects say, where the distribution does not or is an extra that need not be
+# installed.
 STATED = {
     "OpenEXR": "BSD-3-Clause",
     "pillow-heif": "BSD-3-Clause; its wheel carries libheif (LGPL-3.0)",
@@ -37,8 +39,14 @@ def licence(name: str) -> tuple[str, str]:
     """(version, licence) of an installed distribution."""
     data = metadata.metadata(name)
     text = data.get("License-Expression") or ""
-    trove = [c.split(" :: ")[-1] for c in data.get_all("Classifier") or [] if c.startswith("License ::")]
-    text = text or "; ".join(t for t in trove if t != "OSI Approved") or (data.get("License") or "not stated").splitlines()[0]
+    trove = [
+        c.split(" :: ")[-1] for c in data.get_all("Classifier") or [] if c.startswith("License ::")
+    ]
+    text = (
+        text
+        or "; ".join(t for t in trove if t != "OSI Approved")
+        or (data.get("License") or "not stated").splitlines()[0]
+    )
     text = STATED.get(name, text)
     return data["Version"], re.sub(r"\s+", " ", text)[:80]
 
@@ -65,7 +73,16 @@ def closure(names: list[str]) -> list[str]:
 
 
 def table(rows: list[tuple[str, str, str]]) -> str:
-    return "\n".join(["| package | version | licence |", "|---|---|---|", *(f"| {' | '.join(r)} |" for r in rows)]) + "\n"
+    return (
+        "\n".join(
+            [
+                "| package | version | licence |",
+                "|---|---|---|",
+                *(f"| {' | '.join(r)} |" for r in rows),
+            ]
+        )
+        + "\n"
+    )
 
 
 def page() -> str:
@@ -82,15 +99,26 @@ def page() -> str:
                 rows.append((name, "any", STATED[name]))
         parts.append(f"`pip install relit[{extra}]`\n\n{table(rows)}")
     rows = []
-    for folder, kinds in (("viewer", ("dependencies", "devDependencies")), ("tools/validator", ("dependencies",))):
+    for folder, kinds in (
+        ("viewer", ("dependencies", "devDependencies")),
+        ("tools/validator", ("dependencies",)),
+    ):
         wanted = json.loads((ROOT / folder / "package.json").read_text())
         for kind in kinds:
             for name, version in wanted.get(kind, {}).items():
-                about = json.loads((ROOT / folder / "node_modules" / name / "package.json").read_text())
-                use = "in the page" if kind == "dependencies" and folder == "viewer" else "for building and tests"
+                about = json.loads(
+                    (ROOT / folder / "node_modules" / name / "package.json").read_text()
+                )
+                use = (
+                    "in the page"
+                    if kind == "dependencies" and folder == "viewer"
+                    else "for building and tests"
+                )
                 rows.append((f"{name} ({use})", version, str(about.get("license", "see its page"))))
     parts += ["## npm\n", table(rows)]
-    parts.append("## From the system\n\nlibLLVM 17 or newer (Apache-2.0 with LLVM exceptions); the NVIDIA driver for `--device cuda`.\n")
+    parts.append(
+        "## From the system\n\nlibLLVM 17 or newer (Apache-2.0 with LLVM exceptions); the NVIDIA driver for `--device cuda`.\n"
+    )
     return "\n".join(parts)
 
 

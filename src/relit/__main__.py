@@ -1,6 +1,6 @@
 """`python -m relit`: the same as the `relit` command."""
 
-from relit.cli import command
+from relit.cli.main import command
 
 if __name__ == "__main__":
     command()

@@ -1,11 +1,11 @@
 """Relit from Python and in notebooks; reads like the command line.
 
-    import relit
-    capture = relit.open_capture("photos/")
-    asset = relit.reconstruct("photos/", "runs/mug", quality="draft")
-    asset.relight("sunset.hdr")            # pictures
-    asset.export("mug.glb")
-    asset                                  # in a notebook: the object, to be turned
+import relit
+capture = relit.open_capture("photos/")
+asset = relit.reconstruct("photos/", "runs/mug", quality="draft")
+asset.relight("sunset.hdr")            # pictures
+asset.export("mug.glb")
+asset                                  # in a notebook: the object, to be turned
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from relit.scene import Asset
 
 @dataclass(frozen=True)
 class AssetFolder:
-    """An asset on disk: what `reconstruct` returns and `load` opens. run: the run folder or the asset folder."""
+    """An asset on disk: what `reconstruct` returns and `load` opens. run: the run folder or the
+    asset folder."""
 
     run: Path
 
@@ -40,11 +41,19 @@ class AssetFolder:
         return find_asset(self.run)
 
     def relight(
-        self, light: str | Path, out: str | Path | None = None, *, cameras: str | Path = "orbit:1", device: str = "auto", **options
+        self,
+        light: str | Path,
+        out: str | Path | None = None,
+        *,
+        cameras: str | Path = "orbit:1",
+        device: str = "auto",
+        **options,
     ) -> list:
-        """Pictures under another light (`relit relight`). out: a folder or FILE.mp4, then the files are returned; None returns PIL images.
+        """Pictures under another light (`relit relight`). out: a folder or FILE.mp4, then the files
+        are returned; None returns PIL images.
 
-        light: lat-long .hdr or .exr. cameras: 'capture', 'orbit:N' or a transforms.json. options: spp, size, rotate, albedo_scale, ...
+        light: lat-long .hdr or .exr. cameras: 'capture', 'orbit:N' or a transforms.json. options:
+        spp, size, rotate, albedo_scale, ...
         """
         from PIL import Image
 
@@ -59,8 +68,8 @@ class AssetFolder:
             return [Image.open(f).copy() for f in files if f.suffix == ".png"]
 
     def export(self, out: str | Path, format: str | None = None) -> Path:
-        """Another form of the asset (`relit export`): glb, obj, ply, mitsuba, gaussians (its light alone, .json) or html, by default told
-        by the ending. Returns the file."""
+        """Another form of the asset (`relit export`): glb, obj, ply, mitsuba, gaussians (its light
+        alone, .json) or html, by default told by the ending. Returns the file."""
         from relit.asset.export import export_asset
         from relit.asset.forms import form_of
         from relit.viewer.export_html import export_html
@@ -76,7 +85,7 @@ class AssetFolder:
     def evaluate(self, truth: str | Path, *, device: str = "auto", **options) -> dict:
         """Every figure that a known truth allows (`relit evaluate`)."""
         from relit.device import use_device
-        from relit.evaluate.protocols import evaluate
+        from relit.evaluate.dispatch import evaluate
 
         use_device(device)
         return evaluate(self.run, truth, **options)
@@ -99,9 +108,10 @@ class AssetFolder:
 def reconstruct(input: str | Path, out: str | Path, **options) -> AssetFolder:
     """Photos into a relightable asset (`relit reconstruct`); the same call again resumes.
 
-    options: those of `relit.reconstruct.reconstruct`: capture, quality, device, seed, masks, sphere, max_side, focal, settings, ...
+    options: those of `relit.reconstruction.reconstruct`: capture, quality, device, seed, masks,
+    sphere, max_side, focal, settings, ...
     """
-    from relit.reconstruct import reconstruct as job
+    from relit.reconstruction import reconstruct as job
 
     return AssetFolder(job(input, out, **options).parent)
 
@@ -115,8 +125,9 @@ def load(run: str | Path) -> AssetFolder:
 
 
 def inspect(input: str | Path, **job) -> dict:
-    """What an input was recognised as and what is odd about it (`relit inspect --json`). job: quality, masks, sphere, max_side, capture."""
-    from relit.plan import Job
-    from relit.preflight import inspect as preflight
+    """What an input was recognised as and what is odd about it (`relit inspect --json`). job:
+    quality, masks, sphere, max_side, capture."""
+    from relit.job import Job
+    from relit.preflight.inspect import inspect as preflight
 
     return preflight(input, Job(**job))

@@ -1,16 +1,17 @@
-"""THE page of conventions: every frame, unit and encoding of Relit, and every conversion between them.
+"""THE page of conventions: every frame, unit and encoding of Relit, and every conversion between
+them.
 
 Inside Relit there is one frame and one encoding:
 
-* Camera axes are OpenCV's: +x right, +y down, +z into the scene. Poses are named `b_from_a` and are 4x4
-  float64 matrices that act on column vectors: `x_b = b_from_a @ x_a`.
-* Images are row-major (H, W, C) float32, linear Rec.709 radiance. The centre of the pixel in column i and
-  row j is at (i + 0.5, j + 0.5).
+* Camera axes are OpenCV's: +x right, +y down, +z into the scene. Poses are named `b_from_a` and are
+  4x4 float64 matrices that act on column vectors: `x_b = b_from_a @ x_a`.
+* Images are row-major (H, W, C) float32, linear Rec.709 radiance. The centre of the pixel in column
+  i and row j is at (i + 0.5, j + 0.5).
 * Roughness r is perceptual (glTF's); the GGX width is alpha = r^2.
-* Environment maps are lat-long images in Mitsuba's axes with an identity `to_world`: the row is the polar angle
-  from +Y, and u(+X) = .25, u(+Z) = .5, u(-X) = .75, u(-Z) = 0.
-* `world` is the frame of the user's cameras; `unit` is the frame in which the object sphere is the unit sphere
-  at the origin (`world_from_unit` is a similarity).
+* Environment maps are lat-long images in Mitsuba's axes with an identity `to_world`: the row is the
+  polar angle from +Y, and u(+X) = .25, u(+Z) = .5, u(-X) = .75, u(-Z) = 0.
+* `world` is the frame of the user's cameras; `unit` is the frame in which the object sphere is the
+  unit sphere at the origin (`world_from_unit` is a similarity).
 
 Each conversion below has a round-trip test in `tests/test_conventions.py`.
 """
@@ -19,8 +20,12 @@ from __future__ import annotations
 
 import numpy as np
 
-FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV <-> OpenGL camera axes (x right, y up, looks along -z)
-FLIP_XY = np.diag([-1.0, -1.0, 1.0, 1.0])  # OpenCV <-> Mitsuba camera axes (x left, y up, looks along +z)
+FLIP_YZ = np.diag(
+    [1.0, -1.0, -1.0, 1.0]
+)  # OpenCV <-> OpenGL camera axes (x right, y up, looks along -z)
+FLIP_XY = np.diag(
+    [-1.0, -1.0, 1.0, 1.0]
+)  # OpenCV <-> Mitsuba camera axes (x left, y up, looks along +z)
 
 
 # ---------------------------------------------------------------- colour
@@ -29,13 +34,17 @@ FLIP_XY = np.diag([-1.0, -1.0, 1.0, 1.0])  # OpenCV <-> Mitsuba camera axes (x l
 def srgb_from_linear(linear):
     """Linear Rec.709 -> sRGB (IEC 61966-2-1), not clipped above 1. Any shape, float."""
     x = np.maximum(np.asarray(linear, dtype=np.float32), 0.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 0.0031308), 1 / 2.4) - 0.055).astype(np.float32)
+    return np.where(
+        x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 0.0031308), 1 / 2.4) - 0.055
+    ).astype(np.float32)
 
 
 def linear_from_srgb(encoded):
     """sRGB (IEC 61966-2-1) -> linear Rec.709. Any shape, float."""
     x = np.maximum(np.asarray(encoded, dtype=np.float32), 0.0)
-    return np.where(x <= 0.04045, x / 12.92, np.power((np.maximum(x, 0.04045) + 0.055) / 1.055, 2.4)).astype(np.float32)
+    return np.where(
+        x <= 0.04045, x / 12.92, np.power((np.maximum(x, 0.04045) + 0.055) / 1.055, 2.4)
+    ).astype(np.float32)
 
 
 def luminance(linear):
@@ -86,7 +95,8 @@ def world_from_mitsuba_camera(world_from_camera):
 
 
 def cv_from_mitsuba_axes(vector):
-    """(..., 3) along Mitsuba's camera axes (left, up, forward) -> along OpenCV's (right, down, forward). Its own inverse."""
+    """(..., 3) along Mitsuba's camera axes (left, up, forward) -> along OpenCV's (right, down,
+    forward). Its own inverse."""
     return np.asarray(vector, dtype=np.float64) @ FLIP_XY[:3, :3]
 
 
@@ -104,7 +114,8 @@ def scale_of(b_from_a):
 
 
 def move_pose(b_from_a, a_from_camera):
-    """Carry a camera pose through a similarity `b_from_a`: the rotation stays a rotation, the centre moves."""
+    """Carry a camera pose through a similarity `b_from_a`: the rotation stays a rotation, the
+    centre moves."""
     s = scale_of(b_from_a)
     out = np.asarray(b_from_a, dtype=np.float64) @ np.asarray(a_from_camera, dtype=np.float64)
     out[:3, :3] /= s
@@ -121,7 +132,8 @@ def move_points(b_from_a, points):
 
 
 def uv_from_direction(direction):
-    """Unit directions (..., 3) -> lat-long coordinates (..., 2) in [0, 1): Mitsuba's `envmap` with identity `to_world`."""
+    """Unit directions (..., 3) -> lat-long coordinates (..., 2) in [0, 1): Mitsuba's `envmap` with
+    identity `to_world`."""
     d = np.asarray(direction, dtype=np.float64)
     u = np.arctan2(d[..., 0], -d[..., 2]) / (2 * np.pi)
     v = np.arccos(np.clip(d[..., 1], -1.0, 1.0)) / np.pi
@@ -149,7 +161,8 @@ def environment_solid_angles(height, width):
 
 
 def gltf_environment(environment):
-    """Lat-long map in Relit's axes -> the axes of three.js / glTF viewers: a roll by W/4, no mirror."""
+    """Lat-long map in Relit's axes -> the axes of three.js / glTF viewers: a roll by W/4, no
+    mirror."""
     return np.roll(environment, environment.shape[1] // 4, axis=1)
 
 
@@ -159,7 +172,8 @@ def environment_from_gltf(environment):
 
 
 def rotate_environment(environment, b_from_a):
-    """Resample a lat-long map (H, W, 3) given in frame a so that it stands in frame b (rotation 3x3 or 4x4), bilinear."""
+    """Resample a lat-long map (H, W, 3) given in frame a so that it stands in frame b (rotation 3x3
+    or 4x4), bilinear."""
     rotation = np.asarray(b_from_a, dtype=np.float64)[:3, :3]
     rotation = rotation / np.cbrt(np.linalg.det(rotation))
     h, w = environment.shape[:2]

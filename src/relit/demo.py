@@ -1,4 +1,5 @@
-"""`relit demo`: the whole way on an object made of formulas. Nothing is downloaded; the truth is known, so the result is scored."""
+"""`relit demo`: the whole way on an object made of formulas. Nothing is downloaded; the truth is
+known, so the result is scored."""
 
 from __future__ import annotations
 
@@ -11,24 +12,36 @@ from relit.log import Log
 
 VIEWS, TEST_VIEWS, RESOLUTION = 36, 4, 256
 SPP, TEST_SPP = 32, 64  # samples a pixel of the photos, and of what is measured against
-SHOWN = ("novel_psnr", "relit_psnr", "albedo_psnr", "normal_mae", "roughness_mse", "chamfer_percent", "glb_roundtrip_psnr")
+SHOWN = (
+    "novel_psnr",
+    "relit_psnr",
+    "albedo_psnr",
+    "normal_mae",
+    "roughness_mse",
+    "chamfer_percent",
+    "glb_roundtrip_psnr",
+)
 
 
-def demo(out: str | Path, *, device: str = "auto", quality: str = "draft", overwrite: bool = False) -> Path:
-    """Render the pawn of `capture.procedural`, reconstruct it, score it and write the report; returns the run folder.
+def demo(
+    out: str | Path, *, device: str = "auto", quality: str = "draft", overwrite: bool = False
+) -> Path:
+    """Render the pawn of `synthesize.procedural`, reconstruct it, score it and write the report;
+    returns the run folder.
 
-    `out` gets: truth.glb, light.exr, other_light.exr, capture/ (photos and truth), run/ (asset, report.html, evaluation.json).
-    The same call again takes up what was stopped. overwrite: reconstruct anew.
+    `out` gets: truth.glb, light.exr, other_light.exr, capture/ (photos and truth), run/ (asset,
+    report.html, evaluation.json). The same call again takes up what was stopped. overwrite:
+    reconstruct anew.
     """
     from relit.asset.gltf import write_glb
-    from relit.capture.procedural import evening, pawn, studio
-    from relit.capture.synthetic import synthesize_multiview
     from relit.device import use_device
-    from relit.evaluate.protocols import evaluate
-    from relit.evaluate.report import write_report
+    from relit.evaluate.dispatch import evaluate
     from relit.images import write_linear
-    from relit.plan import Job, open_input
-    from relit.reconstruct import reconstruct
+    from relit.job import Job, open_input
+    from relit.reconstruction import reconstruct
+    from relit.report.page import write_report
+    from relit.synthesize.multiview import synthesize_multiview
+    from relit.synthesize.procedural import evening, pawn, studio
 
     out, log = Path(out), Log()
     if out.exists() and not out.is_dir():
@@ -54,7 +67,9 @@ def demo(out: str | Path, *, device: str = "auto", quality: str = "draft", overw
     )
     log.say("2 of 4  reconstructing shape, material and light from the photos")
     run = out / "run"
-    reconstruct(out / "capture", run, device=device, quality=quality, overwrite=overwrite, report=False)
+    reconstruct(
+        out / "capture", run, device=device, quality=quality, overwrite=overwrite, report=False
+    )
     log.say("3 of 4  scoring against the truth")
     result = evaluate(run, out / "capture", spp=TEST_SPP)
     write_text(run / "evaluation.json", json.dumps(result, indent=1) + "\n")

@@ -1,4 +1,5 @@
-"""Choosing where Dr.Jit runs. Call `use_device` once, before anything that imports Mitsuba's types."""
+"""Choosing where Dr.Jit runs. Call `use_device` once, before anything that imports Mitsuba's
+types."""
 
 from __future__ import annotations
 
@@ -13,14 +14,20 @@ from pathlib import Path
 from relit.errors import EXIT_ENVIRONMENT, UserError
 
 MIN_LLVM = 17  # older ones abort the process on x86-64 with AVX-512: "Cannot select: fmaximum"
-LLVM_PATTERNS = ["/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "/usr/lib64/libLLVM*.so*", "/usr/local/lib/libLLVM*.so*"]
+LLVM_PATTERNS = [
+    "/usr/lib/*/libLLVM*.so*",
+    "/usr/lib/llvm-*/lib/libLLVM*.so*",
+    "/usr/lib64/libLLVM*.so*",
+    "/usr/local/lib/libLLVM*.so*",
+]
 VARIANTS = {"cpu": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 LLVM_FIX = "sudo apt-get install -y libllvm19   (Debian, Ubuntu; libLLVM 17 or newer), or set DRJIT_LIBLLVM_PATH to the file"
 OPTIX_FIX = "in a container: NVIDIA_DRIVER_CAPABILITIES=compute,graphics,utility; elsewhere: sudo apt-get install -y libnvidia-gl-VERSION"
 
 
 def find_libllvm() -> str | None:
-    """Path of the newest libLLVM (>= MIN_LLVM) shared library on this machine, or None. `DRJIT_LIBLLVM_PATH` goes first."""
+    """Path of the newest libLLVM (>= MIN_LLVM) shared library on this machine, or None.
+    `DRJIT_LIBLLVM_PATH` goes first."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given if Path(given).exists() else None
@@ -29,12 +36,15 @@ def find_libllvm() -> str | None:
 
 
 def _llvm_version(path: str) -> tuple[int, ...]:
-    digits = "".join(c if c.isdigit() else " " for c in Path(path).resolve().name.replace("libLLVM", ""))
+    digits = "".join(
+        c if c.isdigit() else " " for c in Path(path).resolve().name.replace("libLLVM", "")
+    )
     return tuple(int(x) for x in digits.split()) or (0,)
 
 
 def has_optix() -> bool:
-    """Is OptiX there, which comes with NVIDIA's driver? Without it a GPU computes but traces no rays, as in many containers."""
+    """Is OptiX there, which comes with NVIDIA's driver? Without it a GPU computes but traces no
+    rays, as in many containers."""
     if sys.platform == "win32":
         return True  # the driver keeps it where only its own search finds it
     try:
@@ -47,7 +57,8 @@ def has_optix() -> bool:
 def use_device(device: str = "auto") -> str:
     """Set Mitsuba's variant for `device` ('auto', 'cpu', 'cuda') and return 'cpu' or 'cuda'.
 
-    Raises UserError (exit code 5) when the device is not there. 'auto' takes the GPU when there is one that traces rays.
+    Raises UserError (exit code 5) when the device is not there. 'auto' takes the GPU when there is
+    one that traces rays.
     """
     llvm = find_libllvm()
     if llvm:
@@ -79,7 +90,8 @@ def use_device(device: str = "auto") -> str:
 
 
 def load_pycolmap():
-    """pycolmap, with SIGTERM's handler as it was: its import installs glog's, which ends the process with a stack trace."""
+    """pycolmap, with SIGTERM's handler as it was: its import installs glog's, which ends the
+    process with a stack trace."""
     before = signal.getsignal(signal.SIGTERM)
     import pycolmap
 

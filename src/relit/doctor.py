@@ -24,8 +24,8 @@ MEMORY_NEEDED = 4e9  # bytes; quality standard stays below it
 DISK_NEEDED = 1e9  # bytes of a run folder with its checkpoints, generously
 PROBE_SECONDS = 120  # a cold start of the compiler on a slow machine takes a tenth of this
 
-# One kernel forward and backward against a central difference, on one backend. In a process of its own: an old libLLVM
-# aborts the process instead of raising.
+# One kernel forward and backward against a central difference, on one backend. In a process of its
+# own: an old libLLVM aborts the process instead of raising.
 PROBE = """
 import sys
 import drjit as dr
@@ -53,7 +53,8 @@ print("gradient", dr.grad(x)[0], difference[0])
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the report. ok: False is a lack that stops Relit, None one that does not. fix: the one command, or ''."""
+    """One line of the report. ok: False is a lack that stops Relit, None one that does not. fix:
+    the one command, or ''."""
 
     name: str
     ok: bool | None
@@ -79,7 +80,11 @@ def verdict(checks: list[Check]) -> int:
     """Exit code: 0 if a reconstruction can run on the CPU or the GPU, else 5."""
     by_name = {c.name: c for c in checks}
     works = any(by_name[n].ok for n in ("gradient on cpu", "gradient on cuda") if n in by_name)
-    needed = all(c.ok is not False for c in checks if c.name not in ("libLLVM", "gradient on cpu", "gradient on cuda"))
+    needed = all(
+        c.ok is not False
+        for c in checks
+        if c.name not in ("libLLVM", "gradient on cpu", "gradient on cuda")
+    )
     return EXIT_OK if works and needed else EXIT_ENVIRONMENT
 
 
@@ -94,13 +99,20 @@ def as_text(checks: list[Check]) -> str:
         lines += ["", "to mend:", *mends]
     if optional:
         lines += ["", "optional:", *optional]
-    lines += ["", "Relit can run on this machine." if verdict(checks) == EXIT_OK else "Relit cannot run on this machine yet."]
+    lines += [
+        "",
+        "Relit can run on this machine."
+        if verdict(checks) == EXIT_OK
+        else "Relit cannot run on this machine yet.",
+    ]
     return "\n".join(lines)
 
 
 def as_json(checks: list[Check]) -> str:
     """{"ok": bool, "checks": [{name, ok, found, fix}]}"""
-    return json.dumps({"ok": verdict(checks) == EXIT_OK, "checks": [asdict(c) for c in checks]}, indent=2)
+    return json.dumps(
+        {"ok": verdict(checks) == EXIT_OK, "checks": [asdict(c) for c in checks]}, indent=2
+    )
 
 
 # ---------------------------------------------------------------- the checks
@@ -108,7 +120,12 @@ def as_json(checks: list[Check]) -> str:
 
 def _python() -> Check:
     good = (3, 10) <= sys.version_info[:2] <= (3, 13)
-    return Check("Python", good, f"{platform.python_version()}, {sys.executable}", "" if good else "make setup PYTHON=python3.12")
+    return Check(
+        "Python",
+        good,
+        f"{platform.python_version()}, {sys.executable}",
+        "" if good else "make setup PYTHON=python3.12",
+    )
 
 
 def _wheels() -> Check:
@@ -116,7 +133,11 @@ def _wheels() -> Check:
         wanted = importlib.metadata.requires("relit") or []
     except importlib.metadata.PackageNotFoundError:
         return Check("wheels", False, "relit is not installed in this Python", "make setup")
-    names = [re.split(r"[^A-Za-z0-9_.-]", r)[0] for r in wanted if "extra ==" not in r and "python_version" not in r]
+    names = [
+        re.split(r"[^A-Za-z0-9_.-]", r)[0]
+        for r in wanted
+        if "extra ==" not in r and "python_version" not in r
+    ]
     missing, versions = [], {}
     for name in names:
         try:
@@ -133,12 +154,23 @@ def _llvm() -> Check:
     path = find_libllvm()
     if path:
         number = re.search(r"libLLVM[-.a-z]*([0-9.]+)", Path(path).resolve().name)
-        return Check("libLLVM", True, f"{number.group(1).strip('.') if number else 'version unknown'}, {path}")
+        return Check(
+            "libLLVM",
+            True,
+            f"{number.group(1).strip('.') if number else 'version unknown'}, {path}",
+        )
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
-        return Check("libLLVM", False, f"DRJIT_LIBLLVM_PATH names a file that is not there: {given}", "unset DRJIT_LIBLLVM_PATH")
+        return Check(
+            "libLLVM",
+            False,
+            f"DRJIT_LIBLLVM_PATH names a file that is not there: {given}",
+            "unset DRJIT_LIBLLVM_PATH",
+        )
     old = sorted({p for pattern in LLVM_PATTERNS for p in glob.glob(pattern)})
-    found = f"only older ones than {MIN_LLVM}: {', '.join(old)}" if old else "none in the usual places"
+    found = (
+        f"only older ones than {MIN_LLVM}: {', '.join(old)}" if old else "none in the usual places"
+    )
     return Check("libLLVM", False, found, LLVM_FIX)
 
 
@@ -148,24 +180,47 @@ def _cuda() -> list[Check]:
         return [Check("CUDA", None, "no NVIDIA driver found; the CPU is used")]
     query = _output([smi, "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"])
     if not query:
-        return [Check("CUDA", None, "nvidia-smi is there but answers nothing; the CPU is used", "nvidia-smi")]
+        return [
+            Check(
+                "CUDA",
+                None,
+                "nvidia-smi is there but answers nothing; the CPU is used",
+                "nvidia-smi",
+            )
+        ]
     found = "; ".join(query.splitlines())
     if not has_optix():
-        return [Check("CUDA", None, f"{found}, without OptiX (libnvoptix.so.1), which traces rays; the CPU is used", OPTIX_FIX)]
+        return [
+            Check(
+                "CUDA",
+                None,
+                f"{found}, without OptiX (libnvoptix.so.1), which traces rays; the CPU is used",
+                OPTIX_FIX,
+            )
+        ]
     return [Check("CUDA", True, found)]
 
 
 def _gradient(device: str) -> Check:
     name = f"gradient on {device}"
     try:
-        done = subprocess.run([sys.executable, "-c", PROBE, device], capture_output=True, text=True, timeout=PROBE_SECONDS)
+        done = subprocess.run(
+            [sys.executable, "-c", PROBE, device],
+            capture_output=True,
+            text=True,
+            timeout=PROBE_SECONDS,
+        )
     except subprocess.TimeoutExpired:
         return Check(name, False, f"no answer in {PROBE_SECONDS} s")
     fix = LLVM_FIX if device == "cpu" else "update the NVIDIA driver, or use --device cpu"
     last = next((line for line in done.stdout.splitlines() if line.startswith("gradient ")), "")
     if done.returncode or not last:
         said = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-        how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+        how = (
+            f"killed by signal {-done.returncode}"
+            if done.returncode < 0
+            else f"exit code {done.returncode}"
+        )
         return Check(name, False, f"the probe died ({how}): {said}", fix)
     gradient, difference = (float(x) for x in last.split()[1:])
     off = abs(gradient - difference) / max(abs(difference), 1e-9)
@@ -184,14 +239,21 @@ def _memory() -> Check:
 
 
 def _cores() -> Check:
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     return Check("cores", True, f"{count}, {platform.machine()}, {platform.system()}")
 
 
 def _disk(folder: Path) -> Check:
     free = shutil.disk_usage(folder).free
     if free < DISK_NEEDED:
-        return Check("disk", False, f"{readable_bytes(free)} free in {folder.resolve()}", "free 1 GB there, or use -o on another disk")
+        return Check(
+            "disk",
+            False,
+            f"{readable_bytes(free)} free in {folder.resolve()}",
+            "free 1 GB there, or use -o on another disk",
+        )
     return Check("disk", True, f"{readable_bytes(free)} free in {folder.resolve()}")
 
 
@@ -212,15 +274,29 @@ def _extras() -> list[Check]:
     def module(name: str, imports: tuple[str, ...], wheels: str, what: str) -> Check:
         have = all(importlib.util.find_spec(i) is not None for i in imports)
         found = what if have else f"{what}: not installed"
-        return Check(name, True if have else None, found, "" if have else f"{sys.executable} -m pip install {wheels}")
+        return Check(
+            name,
+            True if have else None,
+            found,
+            "" if have else f"{sys.executable} -m pip install {wheels}",
+        )
 
     node = shutil.which("node")
     return [
         module("ffmpeg", ("imageio_ffmpeg",), "imageio-ffmpeg", "H.264 videos (else MPEG-4)"),
-        module("segmenter", ("rembg", "onnxruntime"), "rembg onnxruntime", "masks of photos without any hint"),
+        module(
+            "segmenter",
+            ("rembg", "onnxruntime"),
+            "rembg onnxruntime",
+            "masks of photos without any hint",
+        ),
         module("HEIC", ("pillow_heif",), "pillow-heif", "photos of iPhones"),
         module("RAW", ("rawpy",), "rawpy", "raw photos of cameras"),
-        Check("node", True, node) if node else Check("node", None, "no node for the glTF validator", "sudo apt-get install -y nodejs npm"),
+        Check("node", True, node)
+        if node
+        else Check(
+            "node", None, "no node for the glTF validator", "sudo apt-get install -y nodejs npm"
+        ),
     ]
 
 

@@ -36,6 +36,6 @@ class UserError(Exception):
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """" Did you mean 'x'?" or an empty string."""
+    """ " Did you mean 'x'?" or an empty string."""
     close = difflib.get_close_matches(word, list(choices), n=1, cutoff=0.55)
     return f" Did you mean '{close[0]}'?" if close else ""

@@ -1,4 +1,5 @@
-"""Files that survive a crash: atomic writes, arrays without pickle, TOML, content digests, and what a full disk says."""
+"""Files that survive a crash: atomic writes, arrays without pickle, TOML, content digests, and what
+a full disk says."""
 
 from __future__ import annotations
 
@@ -27,12 +28,14 @@ except ModuleNotFoundError:  # Python 3.10
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file such that it is either the old or the new one, whenever the process dies."""
+    """Write a text file such that it is either the old or the new one, whenever the process
+    dies."""
     _atomic(path, lambda file: file.write(text.encode("utf-8")))
 
 
 def save_arrays(path: Path, arrays: dict) -> None:
-    """Write {name: array} as an .npz that `np.load(allow_pickle=False)` reads, atomically, uncompressed."""
+    """Write {name: array} as an .npz that `np.load(allow_pickle=False)` reads, atomically,
+    uncompressed."""
     ready = {key: np.asarray(value) for key, value in arrays.items()}
     objects = [key for key, value in ready.items() if value.dtype.hasobject]
     if objects:
@@ -48,7 +51,16 @@ def save_arrays(path: Path, arrays: dict) -> None:
 
 
 # what np.load raises for damaged files, its header being parsed as Python
-NO_ARRAYS = (OSError, ValueError, TypeError, EOFError, LookupError, SyntaxError, MemoryError, NotImplementedError)
+NO_ARRAYS = (
+    OSError,
+    ValueError,
+    TypeError,
+    EOFError,
+    LookupError,
+    SyntaxError,
+    MemoryError,
+    NotImplementedError,
+)
 NO_ARRAYS = (*NO_ARRAYS, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error)
 
 
@@ -73,7 +85,8 @@ def _atomic(path: Path, write: Callable) -> None:
 
 
 def digests(root: Path, names: Iterable[str]) -> dict[str, str]:
-    """{name: 'size:hash'} of files under `root` (BLAKE2b of the content): a replaced photo is noticed, a moved folder is not."""
+    """{name: 'size:hash'} of files under `root` (BLAKE2b of the content): a replaced photo is
+    noticed, a moved folder is not."""
     out = {}
     for name in names:
         path = root / name
@@ -86,11 +99,18 @@ def digests(root: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def toml_text(config: dict) -> str:
-    """TOML of a dictionary: strings, numbers, booleans, lists of those, and one level of tables. None is left out."""
-    plain = [f"{key} = {_toml_value(v)}" for key, v in config.items() if v is not None and not isinstance(v, dict)]
+    """TOML of a dictionary: strings, numbers, booleans, lists of those, and one level of tables.
+    None is left out."""
+    plain = [
+        f"{key} = {_toml_value(v)}"
+        for key, v in config.items()
+        if v is not None and not isinstance(v, dict)
+    ]
     for key, table in config.items():
         if isinstance(table, dict):
-            plain += ["", f"[{key}]"] + [f"{k} = {_toml_value(v)}" for k, v in table.items() if v is not None]
+            plain += ["", f"[{key}]"] + [
+                f"{k} = {_toml_value(v)}" for k, v in table.items() if v is not None
+            ]
     return "\n".join(plain) + "\n"
 
 
@@ -123,7 +143,8 @@ def read_json(path: Path) -> dict | None:
 
 @contextlib.contextmanager
 def disk_errors(folder: Path) -> Iterator[None]:
-    """Turn 'no space left', 'quota exceeded', 'read-only' and 'permission denied' under `folder` into a UserError (exit code 5)."""
+    """Turn 'no space left', 'quota exceeded', 'read-only' and 'permission denied' under `folder`
+    into a UserError (exit code 5)."""
     try:
         yield
     except OSError as error:
@@ -131,7 +152,8 @@ def disk_errors(folder: Path) -> Iterator[None]:
 
 
 def disk_error(error: OSError, folder: Path) -> UserError | None:
-    """The UserError for an OSError of a full, small or closed disk, or None if it is another one."""
+    """The UserError for an OSError of a full, small or closed disk, or None if it is another
+    one."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         free = shutil.disk_usage(_existing(folder)).free
         return UserError(
@@ -140,10 +162,17 @@ def disk_error(error: OSError, folder: Path) -> UserError | None:
             f"free some space and give the same command again (it resumes), or use another -o: {folder}",
             code=EXIT_ENVIRONMENT,
         )
-    inside = error.filename is not None and Path(os.fsdecode(error.filename)).absolute().is_relative_to(_existing(folder))
+    inside = error.filename is not None and Path(
+        os.fsdecode(error.filename)
+    ).absolute().is_relative_to(_existing(folder))
     if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM) and inside:
         why = "the output folder belongs to someone else or the disk is read-only"
-        return UserError(f"cannot write: {error.strerror}", why, f"choose another -o: {error.filename}", code=EXIT_ENVIRONMENT)
+        return UserError(
+            f"cannot write: {error.strerror}",
+            why,
+            f"choose another -o: {error.filename}",
+            code=EXIT_ENVIRONMENT,
+        )
     return None
 
 

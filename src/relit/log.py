@@ -21,7 +21,8 @@ PLAIN_SECONDS = 10.0  # a progress line in a file or a pipe
 class Log:
     """Lines for the reader: on `stream` as they are, in the file `path` with the time in front.
 
-    Not safe to share between processes; the file is opened for each line, so it may be moved or read meanwhile.
+    Not safe to share between processes; the file is opened for each line, so it may be moved or
+    read meanwhile.
     """
 
     def __init__(self, path: Path | None = None, stream: TextIO | None = None):
@@ -57,7 +58,8 @@ class Log:
 
 
 class Progress:
-    """Stage, step, rate and time left: one line redrawn on a terminal, a plain line every 10 s elsewhere.
+    """Stage, step, rate and time left: one line redrawn on a terminal, a plain line every 10 s
+    elsewhere.
 
     title: what the reader sees. steps: how many there will be, or None when not known.
     """
@@ -75,7 +77,10 @@ class Progress:
         now = time.monotonic()
         if self._first is None:
             self._first = self._window = (now, done)
-        if now - self._shown < (REDRAW_SECONDS if self.tty else PLAIN_SECONDS) and done != self.steps:
+        if (
+            now - self._shown < (REDRAW_SECONDS if self.tty else PLAIN_SECONDS)
+            and done != self.steps
+        ):
             return
         self._measure(now, done)
         self._shown = now
@@ -97,7 +102,9 @@ class Progress:
         if self.steps:
             parts.append(f"{100 * done // self.steps} %")
         if self._rate:
-            parts.append(f"{self._rate:.1f}/s" if self._rate >= 1 else f"{1 / self._rate:.1f} s/step")
+            parts.append(
+                f"{self._rate:.1f}/s" if self._rate >= 1 else f"{1 / self._rate:.1f} s/step"
+            )
             if self.steps and done < self.steps:
                 parts.append(f"{readable_seconds((self.steps - done) / self._rate)} left")
         parts += [f"{name} {value:.4g}" for name, value in values.items()]
@@ -106,7 +113,8 @@ class Progress:
 
 @contextmanager
 def counted(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Gives what is to be called with (done, all) and shows it as a progress line; all may change."""
+    """Gives what is to be called with (done, all) and shows it as a progress line; all may
+    change."""
     progress = Progress(Log(), title, None)
 
     def show(done: int, count: int) -> None:
@@ -137,12 +145,15 @@ def peak_memory() -> int:
 
 
 def available_memory() -> int | None:
-    """Bytes that can be used without swapping (the container's limit counted), or None where the system does not tell."""
+    """Bytes that can be used without swapping (the container's limit counted), or None where the
+    system does not tell."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
         return None
-    free = next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+    free = next(
+        (int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None
+    )
     try:
         limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
         used = int(Path("/sys/fs/cgroup/memory.current").read_text())
@@ -154,7 +165,8 @@ def available_memory() -> int | None:
 class MemoryWatch:
     """Peak resident memory between `start()` and `stop()`, bytes, by sampling twice a second.
 
-    A new maximum of the whole process is exact (the kernel keeps it); a stage that stays below an earlier one's is sampled.
+    A new maximum of the whole process is exact (the kernel keeps it); a stage that stays below an
+    earlier one's is sampled.
     """
 
     def start(self) -> MemoryWatch:

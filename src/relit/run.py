@@ -1,8 +1,9 @@
 """A run folder: what a long job leaves behind, and how it goes on after it was stopped.
 
 RUN/ config.toml  inputs.json  log.txt  metrics.jsonl  stages/<name>/{DONE, *.npz}  previews/*.jpg
-`DONE` is written last, so a stage either is complete or is taken up again from its newest checkpoint. Nothing in the
-folder is an absolute path. One process at a time holds the folder; the kernel drops the lock when that process dies.
+`DONE` is written last, so a stage either is complete or is taken up again from its newest
+checkpoint. Nothing in the folder is an absolute path. One process at a time holds the folder; the
+kernel drops the lock when that process dies.
 """
 
 from __future__ import annotations
@@ -22,10 +23,21 @@ from pathlib import Path
 import numpy as np
 
 from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError
-from relit.files import NO_ARRAYS, disk_errors, load_arrays, parse_toml, read_json, save_arrays, toml_text, write_text
+from relit.files import (
+    NO_ARRAYS,
+    disk_errors,
+    load_arrays,
+    parse_toml,
+    read_json,
+    save_arrays,
+    toml_text,
+    write_text,
+)
 from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_seconds
 
-CHECKPOINT_SECONDS = 20.0  # a checkpoint is due this long after the last one, later if writing one is slow
+CHECKPOINT_SECONDS = (
+    20.0  # a checkpoint is due this long after the last one, later if writing one is slow
+)
 CHECKPOINT_LONGEST = 60.0  # ... but never later than this
 PREVIEW_SECONDS = 10.0  # between two previews of a stage
 METRICS_SECONDS = 0.5  # between two lines of metrics.jsonl
@@ -37,7 +49,10 @@ class Terminated(BaseException):
     """SIGTERM, raised in the main thread so that files are closed and the lock is dropped."""
 
 
-STOPS: dict[int, type[BaseException]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+STOPS: dict[int, type[BaseException]] = {
+    signal.SIGINT: KeyboardInterrupt,
+    signal.SIGTERM: Terminated,
+}
 
 
 class Run:
@@ -48,13 +63,22 @@ class Run:
         self._unlock = weakref.finalize(self, os.close, lock)
 
     @staticmethod
-    def open(folder: str | Path, config: dict, *, resume: bool = True, inputs: dict[str, str] | None = None) -> Run:
+    def open(
+        folder: str | Path,
+        config: dict,
+        *,
+        resume: bool = True,
+        inputs: dict[str, str] | None = None,
+    ) -> Run:
         """Make the run folder, or take it up again.
 
-        config: what decides the result; strings, numbers, booleans, lists and one level of tables (saved as config.toml).
-        inputs: {name: digest} from `digests`; a file that changed since the run was begun is an error.
+        config: what decides the result; strings, numbers, booleans, lists and one level of tables
+        (saved as config.toml).
+        inputs: {name: digest} from `digests`; a file that changed since the run was begun is an
+        error.
         resume: False removes what an earlier run left in the folder (only files that a run makes).
-        Raises UserError when the folder holds something else, another process has it, or its settings or inputs differ.
+        Raises UserError when the folder holds something else, another process has it, or its
+        settings or inputs differ.
         """
         folder = Path(folder)
         wanted = parse_toml(toml_text(config))
@@ -62,9 +86,15 @@ class Run:
             _refuse_foreign(folder)
             try:
                 folder.mkdir(parents=True, exist_ok=True)
-            except (FileNotFoundError, NotADirectoryError, FileExistsError) as error:  # below a file, or in /proc
+            except (
+                FileNotFoundError,
+                NotADirectoryError,
+                FileExistsError,
+            ) as error:  # below a file, or in /proc
                 what = f"the output folder cannot be made: {error.strerror}"
-                raise UserError(what, fix=f"choose another -o: {folder}", code=EXIT_ENVIRONMENT) from None
+                raise UserError(
+                    what, fix=f"choose another -o: {folder}", code=EXIT_ENVIRONMENT
+                ) from None
             lock = _lock(folder)
             try:
                 if not resume:
@@ -73,7 +103,9 @@ class Run:
                 if not (folder / "config.toml").exists():
                     write_text(folder / "config.toml", toml_text(config))
                 if inputs is not None and not (folder / "inputs.json").exists():
-                    write_text(folder / "inputs.json", json.dumps(inputs, indent=1, sort_keys=True) + "\n")
+                    write_text(
+                        folder / "inputs.json", json.dumps(inputs, indent=1, sort_keys=True) + "\n"
+                    )
                 _end_line(folder / "metrics.jsonl")
                 for torn in folder.rglob(".*.part"):  # a process was killed while it wrote
                     torn.unlink(missing_ok=True)
@@ -97,7 +129,8 @@ class Run:
         self.log.say(text)
 
     def progress(self, title: str, steps: int | None = None) -> Callable[[int], None]:
-        """A progress line for steps besides those of a stage: call it with how many are over. steps: how many there will be, or None."""
+        """A progress line for steps besides those of a stage: call it with how many are over.
+        steps: how many there will be, or None."""
         return Progress(self.log, title, steps).update
 
     def done(self, stage: str) -> bool:
@@ -105,39 +138,56 @@ class Run:
         return read_json(self.folder / "stages" / stage / "DONE") is not None
 
     @contextlib.contextmanager
-    def stage(self, name: str, *, steps: int | None = None, title: str | None = None) -> Iterator[Stage]:
+    def stage(
+        self, name: str, *, steps: int | None = None, title: str | None = None
+    ) -> Iterator[Stage]:
         """Run one stage: progress, seconds and peak memory; DONE on a clean exit.
 
-        steps: number of steps that `Stage.step` will report, or None. title: what the reader sees (else the name).
+        steps: number of steps that `Stage.step` will report, or None. title: what the reader sees
+        (else the name).
         """
         stage = Stage(self, name, title or name, steps)
         watch = MemoryWatch().start()
         try:  # a stop that comes right after the first note is told like any other
-            self.log.note(f"{stage.title}: begun" if stage.earlier == 0 else f"{stage.title}: taken up again")
+            self.log.note(
+                f"{stage.title}: begun" if stage.earlier == 0 else f"{stage.title}: taken up again"
+            )
             with disk_errors(self.folder):
                 yield stage
         except BaseException as raised:
             watch.stop()
             error = stopped_by(raised)
             with contextlib.suppress(OSError):
-                self.log.note(f"{stage.title}: stopped by {type(error).__name__} after {readable_seconds(stage.seconds)}")
+                self.log.note(
+                    f"{stage.title}: stopped by {type(error).__name__} after {readable_seconds(stage.seconds)}"
+                )
                 if isinstance(error, (KeyboardInterrupt, Terminated)):
                     self.say(f"stopped in '{stage.title}'; {stage.where_it_resumes()}")
             if error is raised:
                 raise
             raise error from raised
         peak = watch.stop()
-        record = {"name": name, "title": stage.title, "seconds": round(stage.seconds, 3), "peak_memory": peak, "ended": time.time()}
+        record = {
+            "name": name,
+            "title": stage.title,
+            "seconds": round(stage.seconds, 3),
+            "peak_memory": peak,
+            "ended": time.time(),
+        }
         with disk_errors(self.folder):
             write_text(stage.folder / "DONE", json.dumps(record) + "\n")
-        self.say(f"{stage.title}: {readable_seconds(stage.seconds)}, peak memory {readable_bytes(peak)}")
+        self.say(
+            f"{stage.title}: {readable_seconds(stage.seconds)}, peak memory {readable_bytes(peak)}"
+        )
 
     def stages(self) -> list[dict]:
-        """The finished stages in the order in which they ended: name, title, seconds, peak_memory (bytes)."""
+        """The finished stages in the order in which they ended: name, title, seconds, peak_memory
+        (bytes)."""
         return read_stages(self.folder)
 
     def metrics(self) -> list[dict]:
-        """The lines of metrics.jsonl; steps that were repeated after a resume appear once, a torn last line is left out."""
+        """The lines of metrics.jsonl; steps that were repeated after a resume appear once, a torn
+        last line is left out."""
         return read_metrics(self.folder)
 
 
@@ -148,7 +198,9 @@ class Stage:
         self.run, self.name, self.title, self.steps = run, name, title, steps
         self.folder = run.folder / "stages" / name
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.earlier = float((read_json(self.folder / "time.json") or {}).get("seconds", 0.0))  # of stopped processes
+        self.earlier = float(
+            (read_json(self.folder / "time.json") or {}).get("seconds", 0.0)
+        )  # of stopped processes
         self._begun = self._saved = time.monotonic()
         self._unreadable: set[str] = set()  # what was said of them is not said again
         self._written = -math.inf
@@ -158,34 +210,46 @@ class Stage:
 
     @property
     def seconds(self) -> float:
-        """Time spent in this stage, that of earlier processes up to their last checkpoint included."""
+        """Time spent in this stage, that of earlier processes up to their last checkpoint
+        included."""
         return self.earlier + time.monotonic() - self._begun
 
     def step(self, i: int, /, **losses: float | Callable[[], float]) -> None:
-        """Tell that `i` steps (1 ... `steps`) are over. A loss given as a callable is evaluated only when a line is written."""
+        """Tell that `i` steps (1 ... `steps`) are over. A loss given as a callable is evaluated
+        only when a line is written."""
         now = time.monotonic()
         values: dict[str, float] = {}
         if losses and (now - self._written >= METRICS_SECONDS or i == self.steps):
             values = {key: float(v() if callable(v) else v) for key, v in losses.items()}
             self._written = now
             of = {} if self.steps is None else {"of": self.steps}
-            record = {"stage": self.name, "step": i, **of, "seconds": round(self.seconds, 3), **{k: _finite(v) for k, v in values.items()}}
+            record = {
+                "stage": self.name,
+                "step": i,
+                **of,
+                "seconds": round(self.seconds, 3),
+                **{k: _finite(v) for k, v in values.items()},
+            }
             with (self.run.folder / "metrics.jsonl").open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record) + "\n")
         self._progress.update(i, values)
 
     def checkpoint_due(self) -> bool:
-        """True when the last checkpoint (or the beginning) is 20 s ago; up to 60 s where writing one takes long."""
+        """True when the last checkpoint (or the beginning) is 20 s ago; up to 60 s where writing
+        one takes long."""
         return time.monotonic() - self._saved >= self._interval
 
     def save(self, name: str, /, **arrays) -> None:
-        """Write arrays to <name>.npz in the stage's folder, atomically. Anything `np.asarray` takes, but no objects."""
+        """Write arrays to <name>.npz in the stage's folder, atomically. Anything `np.asarray`
+        takes, but no objects."""
         begun = time.monotonic()
         with disk_errors(self.run.folder):
             save_arrays(self.folder / f"{name}.npz", arrays)
             write_text(self.folder / "time.json", json.dumps({"seconds": round(self.seconds, 3)}))
         self._saved = time.monotonic()
-        self._interval = min(max(CHECKPOINT_SECONDS, 10 * (self._saved - begun)), CHECKPOINT_LONGEST)
+        self._interval = min(
+            max(CHECKPOINT_SECONDS, 10 * (self._saved - begun)), CHECKPOINT_LONGEST
+        )
 
     def where_it_resumes(self) -> str:
         """What the same command will do after a stop now."""
@@ -194,7 +258,8 @@ class Stage:
         return f"the same command goes on from the checkpoint of {readable_seconds(time.monotonic() - self._saved)} ago"
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
-        """The arrays of <name>.npz, or None if there is none or it cannot be read (then a line says so)."""
+        """The arrays of <name>.npz, or None if there is none or it cannot be read (then a line says
+        so)."""
         path = self.folder / f"{name}.npz"
         if not path.exists():
             return None
@@ -202,7 +267,9 @@ class Stage:
             return load_arrays(path)
         except NO_ARRAYS as error:
             if name not in self._unreadable:
-                self.run.say(f"note: {path} cannot be read ({type(error).__name__}) and is left out")
+                self.run.say(
+                    f"note: {path} cannot be read ({type(error).__name__}) and is left out"
+                )
                 self._unreadable.add(name)
             return None
 
@@ -229,7 +296,9 @@ def run_arrays(run: Run, stage: str, name: str) -> dict[str, np.ndarray]:
     except NO_ARRAYS as error:
         what = f"what the finished stage '{stage}' has kept cannot be read ({type(error).__name__})"
         why = "the file was damaged or removed; later stages were computed from it"
-        raise UserError(what, why, f"give the same command with --overwrite to begin anew: {path}") from None
+        raise UserError(
+            what, why, f"give the same command with --overwrite to begin anew: {path}"
+        ) from None
 
 
 def read_stages(folder: Path) -> list[dict]:
@@ -263,9 +332,11 @@ _asked_to_stop: list[type[BaseException]] = []  # by a signal, while `terminatio
 
 @contextlib.contextmanager
 def termination() -> Iterator[None]:
-    """While inside, SIGINT raises KeyboardInterrupt and SIGTERM `Terminated` in the main thread, and `stopped_by` remembers it.
+    """While inside, SIGINT raises KeyboardInterrupt and SIGTERM `Terminated` in the main thread,
+    and `stopped_by` remembers it.
 
-    It must be remembered: native loops (Dr.Jit's) turn whatever passes through them into a RuntimeError.
+    It must be remembered: native loops (Dr.Jit's) turn whatever passes through them into a
+    RuntimeError.
     """
 
     def raising(kind: type[BaseException]):
@@ -294,7 +365,11 @@ def stopped_by(error: BaseException) -> BaseException:
 def _refuse_foreign(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise UserError("the output is a file, not a folder", fix=f"give another -o: {folder}")
-    if folder.is_dir() and not (folder / "config.toml").exists() and any(p.name != "lock" for p in folder.iterdir()):
+    if (
+        folder.is_dir()
+        and not (folder / "config.toml").exists()
+        and any(p.name != "lock" for p in folder.iterdir())
+    ):
         what = "the output folder is not empty and is no Relit run"
         raise UserError(what, "nothing was overwritten", f"give a new folder with -o: {folder}")
 
@@ -334,7 +409,10 @@ def _compare(folder: Path, wanted: dict, inputs: dict[str, str] | None) -> None:
     try:
         saved = parse_toml(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise UserError(f"the run's config.toml cannot be read: {error}", fix=f"use another -o, or --overwrite: {path}") from None
+        raise UserError(
+            f"the run's config.toml cannot be read: {error}",
+            fix=f"use another -o, or --overwrite: {path}",
+        ) from None
     a, b = _flat(saved), _flat(wanted)
     keys = [k for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)]
     if keys:
@@ -348,7 +426,11 @@ def _compare(folder: Path, wanted: dict, inputs: dict[str, str] | None) -> None:
     before = read_json(folder / "inputs.json")
     if before is None and (folder / "inputs.json").exists():
         fix = f"use another -o, or --overwrite to begin anew: {folder / 'inputs.json'}"
-        raise UserError("the run's inputs.json cannot be read", "whether the photos are still the same is not known", fix)
+        raise UserError(
+            "the run's inputs.json cannot be read",
+            "whether the photos are still the same is not known",
+            fix,
+        )
     if inputs is not None and before is not None and before != inputs:
         changed = [k for k in dict.fromkeys([*before, *inputs]) if before.get(k) != inputs.get(k)]
         listed = ", ".join(changed[:5]) + (" ..." if len(changed) > 5 else "")
@@ -366,7 +448,9 @@ def _shown(value) -> str:
 def _flat(config: dict) -> dict:
     out = {}
     for key, value in config.items():
-        out.update({f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value})
+        out.update(
+            {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
+        )
     return out
 
 

@@ -1,4 +1,5 @@
-"""Settings of a recipe: a flat frozen dataclass, changed by `--set key=value` or a TOML file, each value checked against its type."""
+"""Settings of a recipe: a flat frozen dataclass, changed by `--set key=value` or a TOML file, each
+value checked against its type."""
 
 from __future__ import annotations
 
@@ -13,18 +14,22 @@ from relit.files import parse_toml
 
 
 def with_pairs(options, pairs: Iterable[str], prefix: str = "--set"):
-    """`options` with 'key=value' texts applied. Raises UserError (code 2) for an unknown key or a value of another type."""
+    """`options` with 'key=value' texts applied. Raises UserError (code 2) for an unknown key or a
+    value of another type."""
     changes = {}
     for pair in pairs:
         key, equals, text = pair.partition("=")
         if not equals:
-            raise UserError(f"{prefix} {pair}: no '=' in it", fix=f"{prefix} key=value", code=EXIT_USAGE)
+            raise UserError(
+                f"{prefix} {pair}: no '=' in it", fix=f"{prefix} key=value", code=EXIT_USAGE
+            )
         changes[key.strip()] = text.strip()
     return with_values(options, changes, prefix)
 
 
 def with_values(options, values: dict, source: str):
-    """`options` with {key: value} applied; values are texts (from the command line) or TOML values. `source` is named in errors."""
+    """`options` with {key: value} applied; values are texts (from the command line) or TOML values.
+    `source` is named in errors."""
     hints = typing.get_type_hints(type(options))
     changes = {}
     for key, value in values.items():
@@ -35,7 +40,9 @@ def with_values(options, values: dict, source: str):
             changes[key] = convert(value, hints[key])
         except ValueError:
             what = f"{source}: {key}={value} is no {describe(hints[key])}"
-            raise UserError(what, f"{key} is {getattr(options, key)!r} by default", code=EXIT_USAGE) from None
+            raise UserError(
+                what, f"{key} is {getattr(options, key)!r} by default", code=EXIT_USAGE
+            ) from None
     try:
         return dataclasses.replace(options, **changes)
     except ValueError as error:  # a recipe's own check
@@ -44,7 +51,8 @@ def with_values(options, values: dict, source: str):
 
 
 def preset(quality: str, presets: dict[str, dict]) -> dict:
-    """What a recipe's options are at 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
+    """What a recipe's options are at 'draft', 'standard' or 'high'. Raises UserError (code 2) for
+    others."""
     if quality not in presets:
         what = f"quality '{quality}' is not known.{did_you_mean(quality, presets)}"
         raise UserError(what, fix=f"one of: {', '.join(presets)}", code=EXIT_USAGE)
@@ -52,23 +60,34 @@ def preset(quality: str, presets: dict[str, dict]) -> dict:
 
 
 def check_parts(without: Iterable[str], known: Iterable[str]) -> None:
-    """Raises ValueError for a part that a recipe does not know how to leave out (its option `without`)."""
+    """Raises ValueError for a part that a recipe does not know how to leave out (its option
+    `without`)."""
     for name in without:
         if name not in known:
-            raise ValueError(f"without={name} is not known.{did_you_mean(name, known)} Known: {', '.join(known)}")
+            raise ValueError(
+                f"without={name} is not known.{did_you_mean(name, known)} Known: {', '.join(known)}"
+            )
 
 
 def check_levels(options) -> None:
-    """Raises UserError (code 2) for options of a recipe whose volume pass has not one number of steps for each level."""
+    """Raises UserError (code 2) for options of a recipe whose volume pass has not one number of
+    steps for each level."""
     if len(options.levels) != len(options.level_steps):
-        raise UserError("levels and level_steps differ in length", fix="give one number of steps per level", code=EXIT_USAGE)
+        raise UserError(
+            "levels and level_steps differ in length",
+            fix="give one number of steps per level",
+            code=EXIT_USAGE,
+        )
 
 
 def convert(value, hint):
-    """A text or a TOML value -> a value of type `hint`: bool, int, float, str, Literal, tuple/list of those, or one of them or None."""
+    """A text or a TOML value -> a value of type `hint`: bool, int, float, str, Literal, tuple/list
+    of those, or one of them or None."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        if value is None or (isinstance(value, str) and value.lower() in ("none", "") and type(None) in args):
+        if value is None or (
+            isinstance(value, str) and value.lower() in ("none", "") and type(None) in args
+        ):
             return None
         for arm in (a for a in args if a is not type(None)):
             try:
@@ -79,11 +98,22 @@ def convert(value, hint):
     if origin is typing.Literal:
         return next((a for a in args if str(a) == str(value)), None) or _fail()
     if origin in (tuple, list):
-        parts = [p for p in value.replace("[", "").replace("]", "").split(",") if p.strip()] if isinstance(value, str) else list(value)
-        kinds = [args[0]] * len(parts) if len(args) != len(parts) or args[-1] is Ellipsis or origin is list else list(args)
+        parts = (
+            [p for p in value.replace("[", "").replace("]", "").split(",") if p.strip()]
+            if isinstance(value, str)
+            else list(value)
+        )
+        kinds = (
+            [args[0]] * len(parts)
+            if len(args) != len(parts) or args[-1] is Ellipsis or origin is list
+            else list(args)
+        )
         if origin is tuple and Ellipsis not in args and len(args) != len(parts):
             raise ValueError
-        return origin(convert(p.strip() if isinstance(p, str) else p, k) for p, k in zip(parts, kinds, strict=True))
+        return origin(
+            convert(p.strip() if isinstance(p, str) else p, k)
+            for p, k in zip(parts, kinds, strict=True)
+        )
     if hint is bool:
         return _bool(value)
     if isinstance(value, bool):
@@ -101,7 +131,16 @@ def convert(value, hint):
 def _bool(value) -> bool:
     if isinstance(value, bool):
         return value
-    words = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+    words = {
+        "true": True,
+        "yes": True,
+        "on": True,
+        "1": True,
+        "false": False,
+        "no": False,
+        "off": False,
+        "0": False,
+    }
     return words[str(value).lower()] if str(value).lower() in words else _fail()
 
 
@@ -118,7 +157,9 @@ def describe(hint) -> str:
         return "one of " + ", ".join(str(a) for a in args)
     if origin in (tuple, list):
         return f"list of {describe(args[0])}"
-    return {bool: "true or false", int: "whole number", float: "number", str: "text"}.get(hint, str(hint))
+    return {bool: "true or false", int: "whole number", float: "number", str: "text"}.get(
+        hint, str(hint)
+    )
 
 
 def read_config(path: str | Path) -> dict:
@@ -127,7 +168,11 @@ def read_config(path: str | Path) -> dict:
     try:
         return parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UserError("the configuration file is not there", fix=f"check the path: {path}", code=EXIT_USAGE) from None
+        raise UserError(
+            "the configuration file is not there", fix=f"check the path: {path}", code=EXIT_USAGE
+        ) from None
     except (OSError, ValueError) as error:
         what = f"the configuration file cannot be read: {error}"
-        raise UserError(what, fix=f"it must be TOML, key = value: {path}", code=EXIT_USAGE) from None
+        raise UserError(
+            what, fix=f"it must be TOML, key = value: {path}", code=EXIT_USAGE
+        ) from None

@@ -1,4 +1,5 @@
-"""A small procedural object: a UV sphere with a dent, textures with an up and a left, a normal map, a light, two cameras."""
+"""A small procedural object: a UV sphere with a dent, textures with an up and a left, a normal map,
+a light, two cameras."""
 
 import numpy as np
 import pytest
@@ -28,14 +29,28 @@ def sphere_mesh(rows=16, columns=32) -> Mesh:
     points *= (1 - 0.2 * np.exp(-8 * ((points - [0, 0, 1]) ** 2).sum(-1)))[..., None]
     index = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    faces = np.concatenate([np.stack([a, b, c], -1)[1:].reshape(-1, 3), np.stack([a, c, d], -1)[:-1].reshape(-1, 3)])
+    faces = np.concatenate(
+        [np.stack([a, b, c], -1)[1:].reshape(-1, 3), np.stack([a, c, d], -1)[:-1].reshape(-1, 3)]
+    )
     # rows at the poles have one real triangle each
     faces = np.concatenate([faces, np.stack([a, b, c], -1)[0], np.stack([a, c, d], -1)[-1]])
     p = points.reshape(-1, 3)
-    area = np.linalg.norm(np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]]), axis=-1)
-    mesh = Mesh(p.astype(np.float32), faces[area > 1e-9].astype(np.int32), None, np.stack([u, v], -1).reshape(-1, 2).astype(np.float32))
+    area = np.linalg.norm(
+        np.cross(p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]]), axis=-1
+    )
+    mesh = Mesh(
+        p.astype(np.float32),
+        faces[area > 1e-9].astype(np.int32),
+        None,
+        np.stack([u, v], -1).reshape(-1, 2).astype(np.float32),
+    )
     used = np.unique(mesh.faces)
-    mesh = Mesh(mesh.vertices[used], np.searchsorted(used, mesh.faces).astype(np.int32), None, mesh.uvs[used])
+    mesh = Mesh(
+        mesh.vertices[used],
+        np.searchsorted(used, mesh.faces).astype(np.int32),
+        None,
+        mesh.uvs[used],
+    )
     return Mesh(mesh.vertices, mesh.faces, vertex_normals(mesh), mesh.uvs)
 
 
@@ -51,7 +66,14 @@ def material() -> Material:
     n = np.stack([0.3 * np.sin(20 * x), 0.3 * np.cos(15 * y), np.ones_like(x)], -1)
     n /= np.linalg.norm(n, axis=-1, keepdims=True)
     f = np.float32
-    return Material(base.astype(f), (0.3 + 0.5 * y).astype(f), (x > 0.5).astype(f), 1.33, (0.5 + 0.5 * x).astype(f), n.astype(f))
+    return Material(
+        base.astype(f),
+        (0.3 + 0.5 * y).astype(f),
+        (x > 0.5).astype(f),
+        1.33,
+        (0.5 + 0.5 * x).astype(f),
+        n.astype(f),
+    )
 
 
 @pytest.fixture(scope="session")
@@ -67,7 +89,9 @@ def asset(mesh, material, environment) -> Asset:
     world_from_asset = np.eye(4)
     world_from_asset[:3, :3] = 2.5 * turn
     world_from_asset[:3, 3] = [3, -1, 2]
-    cameras = tuple((f"images/{i}.png", look_at(p, (3, -1, 2))) for i, p in enumerate([(9, 2, 6), (-3, -2, 6)]))
+    cameras = tuple(
+        (f"images/{i}.png", look_at(p, (3, -1, 2))) for i, p in enumerate([(9, 2, 6), (-3, -2, 6)])
+    )
     meta = {"capture": "multiview", "seed": 3, "seconds": {"surface": 1.5}}
     return Asset(mesh, material, world_from_asset, environment, cameras, meta)
 

@@ -7,10 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relit.asset.asset import SCHEMA, cameras_from_json, cameras_to_json, load_asset, read_cameras, save_asset
+from relit.asset.asset import (
+    SCHEMA,
+    cameras_from_json,
+    cameras_to_json,
+    load_asset,
+    read_cameras,
+    save_asset,
+)
 from relit.errors import UserError
 from relit.images import read_data, read_image
-from relit.rendering.mitsuba_scene import build_scene, render
+from relit.reference.mitsuba_scene import build_scene, render
 
 
 def test_round_trip_after_a_move(tmp_path, asset):
@@ -25,9 +32,17 @@ def test_round_trip_after_a_move(tmp_path, asset):
         for (name, camera), (old_name, old) in zip(got.cameras, asset.cameras, strict=True):
             assert name == old_name
             assert np.allclose(camera.world_from_camera, old.world_from_camera, atol=1e-12)
-            assert (camera.width, camera.fx, camera.cx, camera.cy) == (old.width, old.fx, old.cx, old.cy)
+            assert (camera.width, camera.fx, camera.cx, camera.cy) == (
+                old.width,
+                old.fx,
+                old.cx,
+                old.cy,
+            )
     c = asset.cameras[0][1]
-    a, b = (render(build_scene(x.mesh, x.material, x.world_from_asset, x.environment), c, spp=8) for x in (asset, got))
+    a, b = (
+        render(build_scene(x.mesh, x.material, x.world_from_asset, x.environment), c, spp=8)
+        for x in (asset, got)
+    )
     assert a[..., 3].mean() > 0.1
     assert -10 * np.log10(np.mean((np.clip(a, 0, 1) - np.clip(b, 0, 1)) ** 2)) > 45
 
@@ -35,17 +50,44 @@ def test_round_trip_after_a_move(tmp_path, asset):
 def test_layout(tmp_path, asset, material):
     folder = save_asset(tmp_path / "asset", asset)
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    textures = {f"textures/{k}.png" for k in ("base_color", "roughness", "metallic", "specular", "normal")}
-    assert files == {"asset.json", "object.glb", "cameras.json", "lights/environment.exr", "lights/environment.hdr"} | textures
+    textures = {
+        f"textures/{k}.png" for k in ("base_color", "roughness", "metallic", "specular", "normal")
+    }
+    assert (
+        files
+        == {
+            "asset.json",
+            "object.glb",
+            "cameras.json",
+            "lights/environment.exr",
+            "lights/environment.hdr",
+        }
+        | textures
+    )
     head = json.loads((folder / "asset.json").read_text())
     assert head["schema"] == SCHEMA
     assert np.allclose(head["world_from_asset"], asset.world_from_asset)
     frame = json.loads((folder / "cameras.json").read_text())["frames"][0]
-    assert np.allclose(np.array(frame["transform_matrix"])[:3, 1], -asset.cameras[0][1].world_from_camera[:3, 1])  # OpenGL: y up
-    assert np.abs(read_image(folder / "textures" / "base_color.png").rgb - material.base_color).max() < 0.006
-    assert np.abs(read_data(folder / "textures" / "roughness.png") - material.roughness).max() < 0.003
-    assert np.allclose(read_image(folder / "lights" / "environment.hdr").rgb, asset.environment, rtol=0.02, atol=0.08)
-    assert str(tmp_path) not in (folder / "asset.json").read_text() + (folder / "cameras.json").read_text()
+    assert np.allclose(
+        np.array(frame["transform_matrix"])[:3, 1], -asset.cameras[0][1].world_from_camera[:3, 1]
+    )  # OpenGL: y up
+    assert (
+        np.abs(read_image(folder / "textures" / "base_color.png").rgb - material.base_color).max()
+        < 0.006
+    )
+    assert (
+        np.abs(read_data(folder / "textures" / "roughness.png") - material.roughness).max() < 0.003
+    )
+    assert np.allclose(
+        read_image(folder / "lights" / "environment.hdr").rgb,
+        asset.environment,
+        rtol=0.02,
+        atol=0.08,
+    )
+    assert (
+        str(tmp_path)
+        not in (folder / "asset.json").read_text() + (folder / "cameras.json").read_text()
+    )
 
 
 def test_saving_again_replaces_and_leaves_no_litter(tmp_path, asset):
@@ -79,7 +121,19 @@ def test_a_folder_of_something_else_is_not_overwritten(tmp_path, asset):
 
 
 @pytest.mark.parametrize(
-    "kind", ["missing", "empty", "not json", "list", "no schema", "newer", "no matrix", "nan matrix", "no glb", "bad camera"]
+    "kind",
+    [
+        "missing",
+        "empty",
+        "not json",
+        "list",
+        "no schema",
+        "newer",
+        "no matrix",
+        "nan matrix",
+        "no glb",
+        "bad camera",
+    ],
 )
 def test_bad_folders_get_an_answer(tmp_path, asset, kind):
     folder = tmp_path / "asset"
@@ -100,7 +154,11 @@ def test_bad_folders_get_an_answer(tmp_path, asset, kind):
             data["frames"][0]["fl_x"] = -1
             (folder / "cameras.json").write_text(json.dumps(data))
         else:
-            change = {"no schema": {"schema": "one"}, "newer": {"schema": SCHEMA + 1}, "no matrix": {"world_from_asset": [1, 2]}}
+            change = {
+                "no schema": {"schema": "one"},
+                "newer": {"schema": SCHEMA + 1},
+                "no matrix": {"world_from_asset": [1, 2]},
+            }
             head |= change.get(kind, {"world_from_asset": [[float("nan")] * 4] * 4})
             path.write_text(json.dumps(head))
     with pytest.raises(UserError) as e:
@@ -110,11 +168,15 @@ def test_bad_folders_get_an_answer(tmp_path, asset, kind):
 
 def test_cameras_with_distortion_and_shared_intrinsics(tmp_path, camera):
     distorted = replace(camera, distortion=(0.1, -0.2, 0.001, 0.0, 0.03))
-    [(name, got)] = cameras_from_json(json.loads(json.dumps(cameras_to_json([("a.png", distorted)]))))
+    [(name, got)] = cameras_from_json(
+        json.loads(json.dumps(cameras_to_json([("a.png", distorted)])))
+    )
     assert name == "a.png"
     assert got.distortion == distorted.distortion
     pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
-    text = json.dumps({"camera_angle_x": np.pi / 2, "w": 64, "h": 32, "frames": [{"transform_matrix": pose}]})
+    text = json.dumps(
+        {"camera_angle_x": np.pi / 2, "w": 64, "h": 32, "frames": [{"transform_matrix": pose}]}
+    )
     (tmp_path / "c.json").write_text(text)
     [(_, got)] = read_cameras(tmp_path / "c.json")
     assert (got.fx, got.fy, got.cx, got.cy) == (pytest.approx(32), pytest.approx(32), 32, 16)

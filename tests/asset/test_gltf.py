@@ -10,7 +10,7 @@ import pytest
 from relit.asset.gltf import read_asset_file, write_glb
 from relit.asset.validate import find_validator, validate_glb
 from relit.errors import UserError
-from relit.rendering.mitsuba_scene import build_scene, render
+from relit.reference.mitsuba_scene import build_scene, render
 from relit.scene import Material
 
 
@@ -50,7 +50,9 @@ def test_round_trip_of_the_arrays(tmp_path, mesh, material):
 def test_round_trip_of_the_picture(tmp_path, mesh, material, environment, camera):
     write_glb(tmp_path / "a.glb", mesh, material)
     before = render(build_scene(mesh, material, None, environment), camera, spp=8)
-    after = render(build_scene(*read_asset_file(tmp_path / "a.glb"), None, environment), camera, spp=8)
+    after = render(
+        build_scene(*read_asset_file(tmp_path / "a.glb"), None, environment), camera, spp=8
+    )
     assert before[..., 3].mean() > 0.2
     assert psnr(before, after) > 45
 
@@ -65,13 +67,19 @@ def test_root_transform_is_undone_by_reading(tmp_path, mesh, material):
     assert np.allclose(got.normals, mesh.normals @ (m[:3, :3] / 2).T, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["all maps", "constant", "no uvs", "root transform", "no normal map"])
+@pytest.mark.parametrize(
+    "kind", ["all maps", "constant", "no uvs", "root transform", "no normal map"]
+)
 def test_khronos_validator_has_nothing_to_say(tmp_path, mesh, material, kind):
     missing = find_validator()
     if isinstance(missing, str):
         pytest.skip(missing)
     m, t, transform = mesh, material, None
-    flat = Material(np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1), 0.4, np.float32), np.zeros((1, 1), np.float32))
+    flat = Material(
+        np.full((1, 1, 3), 0.5, np.float32),
+        np.full((1, 1), 0.4, np.float32),
+        np.zeros((1, 1), np.float32),
+    )
     if kind == "constant":
         t = replace(flat, specular=np.full((4, 4), 0.7, np.float32))
     elif kind == "no uvs":
@@ -91,14 +99,23 @@ def test_another_reader_sees_the_same(tmp_path, mesh, material):
     write_glb(tmp_path / "a.glb", mesh, replace(material, specular=None))
     other = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
     assert np.allclose(other.vertices, mesh.vertices)
-    assert np.allclose(other.visual.uv, mesh.uvs * [1, -1] + [0, 1], atol=1e-6)  # trimesh turns v round
+    assert np.allclose(
+        other.visual.uv, mesh.uvs * [1, -1] + [0, 1], atol=1e-6
+    )  # trimesh turns v round
     pbr = other.visual.material
-    assert np.abs(np.asarray(pbr.metallicRoughnessTexture)[..., 1] / 255 - material.roughness).max() < 0.003
-    assert np.abs(np.asarray(pbr.metallicRoughnessTexture)[..., 2] / 255 - material.metallic).max() < 0.003
+    assert (
+        np.abs(np.asarray(pbr.metallicRoughnessTexture)[..., 1] / 255 - material.roughness).max()
+        < 0.003
+    )
+    assert (
+        np.abs(np.asarray(pbr.metallicRoughnessTexture)[..., 2] / 255 - material.metallic).max()
+        < 0.003
+    )
 
 
 def test_factors_and_missing_maps(tmp_path, mesh, material):
-    """Factors multiply the maps; without a metallicRoughness texture they stand alone; no material at all is glTF's default."""
+    """Factors multiply the maps; without a metallicRoughness texture they stand alone; no material
+    at all is glTF's default."""
     write_glb(tmp_path / "a.glb", mesh, material)
     doc, blob = parse(tmp_path / "a.glb")
     pbr = doc["materials"][0]["pbrMetallicRoughness"]
@@ -111,7 +128,11 @@ def test_factors_and_missing_maps(tmp_path, mesh, material):
     del doc["meshes"][0]["primitives"][0]["material"]
     (tmp_path / "c.glb").write_bytes(assemble(doc, blob))
     _, t = read_asset_file(tmp_path / "c.glb")
-    assert (t.base_color.ravel().tolist(), t.roughness.item(), t.metallic.item()) == ([1, 1, 1], 1, 1)
+    assert (t.base_color.ravel().tolist(), t.roughness.item(), t.metallic.item()) == (
+        [1, 1, 1],
+        1,
+        1,
+    )
 
 
 def test_nodes_nest_and_mirrors_keep_the_outside_outside(tmp_path, mesh, material):
@@ -128,7 +149,9 @@ def test_nodes_nest_and_mirrors_keep_the_outside_outside(tmp_path, mesh, materia
     assert len(m.vertices) == 2 * n
     assert np.allclose(m.vertices[:n], mesh.vertices * [-1, 1, 1] + [0, 5, 0], atol=1e-5)
     v = mesh.vertices
-    assert np.allclose(m.vertices[n:], np.stack([v[:, 2] + 4, v[:, 1] + 5, -v[:, 0]], -1), atol=1e-5)
+    assert np.allclose(
+        m.vertices[n:], np.stack([v[:, 2] + 4, v[:, 1] + 5, -v[:, 0]], -1), atol=1e-5
+    )
     corners = m.vertices[m.faces].astype(float)
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert ((face * m.normals[m.faces].mean(1)).sum(-1) > 0).all()
@@ -142,15 +165,23 @@ def test_several_materials_become_one_atlas(tmp_path, mesh, material, environmen
     whole = doc["meshes"][0]["primitives"][0]
     half = doc["accessors"][whole["indices"]]
     count = half["count"] // 6 * 3
-    doc["accessors"] += [{**half, "count": count}, {**half, "count": half["count"] - count, "byteOffset": 4 * count}]
+    doc["accessors"] += [
+        {**half, "count": count},
+        {**half, "count": half["count"] - count, "byteOffset": 4 * count},
+    ]
     last = len(doc["accessors"]) - 1
     doc["materials"].append({**doc["materials"][0], "name": "second"})
-    doc["meshes"][0]["primitives"] = [{**whole, "indices": last - 1}, {**whole, "indices": last, "material": 1}]
+    doc["meshes"][0]["primitives"] = [
+        {**whole, "indices": last - 1},
+        {**whole, "indices": last, "material": 1},
+    ]
     (tmp_path / "b.glb").write_bytes(assemble(doc, blob))
     m, atlas = read_asset_file(tmp_path / "b.glb")
     assert len(m.faces) == len(mesh.faces)
     assert atlas.base_color.shape[1] > 2 * 64
-    before = render(build_scene(*read_asset_file(tmp_path / "a.glb"), None, environment), camera, spp=8)
+    before = render(
+        build_scene(*read_asset_file(tmp_path / "a.glb"), None, environment), camera, spp=8
+    )
     after = render(build_scene(m, atlas, None, environment), camera, spp=8)
     assert psnr(before, after) > 35
 
@@ -193,7 +224,16 @@ def damaged(kind, tmp_path, mesh, material):
 
 @pytest.mark.parametrize(
     "kind",
-    ["empty file", "cut", "draco", "no triangles", "indices beyond the vertices", "accessor that is not there", "wrong suffix", "missing"],
+    [
+        "empty file",
+        "cut",
+        "draco",
+        "no triangles",
+        "indices beyond the vertices",
+        "accessor that is not there",
+        "wrong suffix",
+        "missing",
+    ],
 )
 def test_damaged_files_get_an_answer(tmp_path, mesh, material, kind):
     with pytest.raises(UserError):
@@ -207,7 +247,13 @@ def test_textures_without_coordinates_are_refused(tmp_path, mesh, material):
 
 def test_random_damage_never_ends_in_a_stack_trace(tmp_path, mesh, material):
     """One value of the JSON replaced or removed: the file is read, or the user is told."""
-    small = replace(material, **{k: getattr(material, k)[:4, :4] for k in ("base_color", "roughness", "metallic", "specular", "normal")})
+    small = replace(
+        material,
+        **{
+            k: getattr(material, k)[:4, :4]
+            for k in ("base_color", "roughness", "metallic", "specular", "normal")
+        },
+    )
     write_glb(tmp_path / "a.glb", mesh, small)
     text, blob = parse(tmp_path / "a.glb")
     text = json.dumps(text)
@@ -240,7 +286,8 @@ def test_random_damage_never_ends_in_a_stack_trace(tmp_path, mesh, material):
 
 
 def test_an_atlas_holds_repeated_textures(tmp_path, mesh, material):
-    """A part whose texture coordinates run over several tiles finds the same texels in the atlas."""
+    """A part whose texture coordinates run over several tiles finds the same texels in the
+    atlas."""
     from relit.asset.parts import Part, merge_parts
 
     t = replace(material, specular=None, normal=None)
@@ -253,18 +300,39 @@ def test_an_atlas_holds_repeated_textures(tmp_path, mesh, material):
     merged, atlas = merge_parts(parts, tmp_path)
 
     def look(image, uv):
-        return image[(uv[:, 1] * image.shape[0]).astype(int) % image.shape[0], (uv[:, 0] * image.shape[1]).astype(int) % image.shape[1]]
+        return image[
+            (uv[:, 1] * image.shape[0]).astype(int) % image.shape[0],
+            (uv[:, 0] * image.shape[1]).astype(int) % image.shape[1],
+        ]
 
     n = len(mesh.vertices)
-    off_seam = (np.abs(uvs[:, 0] - np.round(uvs[:, 0])) > 0.1) & (np.abs(uvs[:, 1] - np.round(uvs[:, 1])) > 0.1)
-    assert np.abs(look(atlas.base_color, merged.uvs[:n]) - look(t.base_color, uvs))[off_seam].max() < 0.08
-    assert np.abs(look(atlas.roughness, merged.uvs[:n]) - look(t.roughness, uvs))[off_seam].max() < 0.08
+    off_seam = (np.abs(uvs[:, 0] - np.round(uvs[:, 0])) > 0.1) & (
+        np.abs(uvs[:, 1] - np.round(uvs[:, 1])) > 0.1
+    )
+    assert (
+        np.abs(look(atlas.base_color, merged.uvs[:n]) - look(t.base_color, uvs))[off_seam].max()
+        < 0.08
+    )
+    assert (
+        np.abs(look(atlas.roughness, merged.uvs[:n]) - look(t.roughness, uvs))[off_seam].max()
+        < 0.08
+    )
     inside = (mesh.uvs.min(1) > 0.05) & (mesh.uvs.max(1) < 0.95)
-    assert np.abs(look(atlas.base_color, merged.uvs[n:]) - look(other.base_color, mesh.uvs))[inside].max() < 0.08
+    assert (
+        np.abs(look(atlas.base_color, merged.uvs[n:]) - look(other.base_color, mesh.uvs))[
+            inside
+        ].max()
+        < 0.08
+    )
 
 
 @pytest.mark.parametrize(
-    ("part", "key", "value"), [("accessors", "byteOffset", -8), ("bufferViews", "byteOffset", -8), ("bufferViews", "byteLength", 1 << 30)]
+    ("part", "key", "value"),
+    [
+        ("accessors", "byteOffset", -8),
+        ("bufferViews", "byteOffset", -8),
+        ("bufferViews", "byteLength", 1 << 30),
+    ],
 )
 def test_nothing_outside_the_file_is_read(tmp_path, mesh, material, part, key, value):
     write_glb(tmp_path / "a.glb", mesh, material)

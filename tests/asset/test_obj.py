@@ -55,7 +55,16 @@ def test_broken_files_get_an_answer(tmp_path, obj, mtl):
         read_asset_file(tmp_path / "a.obj")
 
 
-@pytest.mark.parametrize("name", ["spot/spot.obj", "bob/bob_tri.obj", "BoomBox.glb", "painted_wooden_stool_1k.glb", "tea_set_01_1k.glb"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "spot/spot.obj",
+        "bob/bob_tri.obj",
+        "BoomBox.glb",
+        "painted_wooden_stool_1k.glb",
+        "tea_set_01_1k.glb",
+    ],
+)
 def test_models_at_hand_are_read(shared, name):
     mesh, material = read_asset_file(shared / "assets" / name)
     corners = mesh.vertices[mesh.faces].astype(float)

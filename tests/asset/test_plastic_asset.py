@@ -1,4 +1,5 @@
-"""The asset of a flash capture: base colour for glTF in the GLB, the diffuse albedo beside it, and assets from before that was so."""
+"""The asset of a flash capture: base colour for glTF in the GLB, the diffuse albedo beside it, and
+assets from before that was so."""
 
 import json
 from dataclasses import replace
@@ -13,7 +14,7 @@ from relit.edit import edit
 from relit.errors import UserError
 from relit.images import read_data
 from relit.materials.plastic_as_gltf import base_colour
-from relit.rendering.flash_scene import build_flash_scene, render_maps
+from relit.reference.flash_scene import build_flash_scene, render_maps
 from relit.scene import Flash
 
 
@@ -24,14 +25,26 @@ def plastic(asset):
     alpha = np.clip(m.roughness, 0.1, 0.6) ** 2
     roughness = np.sqrt(alpha).astype(np.float32)
     base = base_colour(diffuse, roughness, m.specular, 1.49)
-    m = replace(m, base_color=base, roughness=roughness, metallic=np.zeros((1, 1), np.float32), ior=1.49, diffuse=diffuse)
+    m = replace(
+        m,
+        base_color=base,
+        roughness=roughness,
+        metallic=np.zeros((1, 1), np.float32),
+        ior=1.49,
+        diffuse=diffuse,
+    )
     flash = Flash(np.array([0.1, 0, 0]), np.ones(3))
-    return replace(asset, material=m, environment=None, meta={"material": "rough_plastic"}, flash=flash)
+    return replace(
+        asset, material=m, environment=None, meta={"material": "rough_plastic"}, flash=flash
+    )
 
 
 def test_the_folder_keeps_the_diffuse_albedo(tmp_path, plastic):
     folder = save_asset(tmp_path / "asset", plastic)
-    assert json.loads((folder / "asset.json").read_text())["diffuse_albedo"] == "textures/diffuse_albedo.exr"
+    assert (
+        json.loads((folder / "asset.json").read_text())["diffuse_albedo"]
+        == "textures/diffuse_albedo.exr"
+    )
     got = load_asset(folder)
     np.testing.assert_allclose(got.material.diffuse, plastic.material.diffuse, atol=1e-3)
     assert np.abs(got.material.base_color - plastic.material.base_color).max() < 0.006
@@ -52,14 +65,19 @@ def test_what_is_measured_is_the_diffuse_albedo(tmp_path, plastic):
     true = render_maps(build_flash_scene(plastic.mesh, truth, place), camera)
     inside = maps["coverage"] > 0.99
     np.testing.assert_allclose(maps["diffuse"][inside], true["diffuse"][inside], atol=3e-3)
-    gltf = render_maps(build_flash_scene(got.mesh, replace(got.material, diffuse=None), place), camera)
+    gltf = render_maps(
+        build_flash_scene(got.mesh, replace(got.material, diffuse=None), place), camera
+    )
     assert (gltf["diffuse"][inside] < true["diffuse"][inside] - 0.01).any()
 
 
 def test_folders_from_before(tmp_path, plastic):
     """Their GLB holds the diffuse albedo as base colour, and asset.json names no file."""
     m = plastic.material
-    folder = save_asset(tmp_path / "asset", replace(plastic, material=replace(m, base_color=m.diffuse, diffuse=None)))
+    folder = save_asset(
+        tmp_path / "asset",
+        replace(plastic, material=replace(m, base_color=m.diffuse, diffuse=None)),
+    )
     assert not (folder / "textures" / "diffuse_albedo.exr").exists()
     got = load_asset(folder).material
     assert np.abs(got.diffuse - m.diffuse).max() < 0.006
@@ -78,7 +96,11 @@ def test_mitsubas_plastic_takes_the_diffuse_albedo(tmp_path, plastic, load_scene
     export_asset(folder, "mitsuba", tmp_path / "scene")
     text = (tmp_path / "scene" / "scene.xml").read_text()
     assert "textures/diffuse_albedo.exr" in text and "base_color.png" not in text
-    np.testing.assert_allclose(read_data(tmp_path / "scene" / "textures" / "diffuse_albedo.exr"), plastic.material.diffuse, atol=1e-3)
+    np.testing.assert_allclose(
+        read_data(tmp_path / "scene" / "textures" / "diffuse_albedo.exr"),
+        plastic.material.diffuse,
+        atol=1e-3,
+    )
     assert load_scene(tmp_path / "scene" / "scene.xml") is not None
 
 
@@ -86,7 +108,9 @@ def test_editing_keeps_both_together(tmp_path, plastic):
     folder = save_asset(tmp_path / "asset", plastic)
     edit(folder, tmp_path / "tinted", tint=(0.5, 1, 1))
     tinted = load_asset(tmp_path / "tinted").material
-    np.testing.assert_allclose(tinted.diffuse[..., 0], 0.5 * plastic.material.diffuse[..., 0], atol=1e-3)
+    np.testing.assert_allclose(
+        tinted.diffuse[..., 0], 0.5 * plastic.material.diffuse[..., 0], atol=1e-3
+    )
     edit(folder, tmp_path / "rough", roughness=0.8)
     rough = load_asset(tmp_path / "rough").material
     np.testing.assert_allclose(rough.diffuse, plastic.material.diffuse, atol=1e-3)
@@ -94,17 +118,24 @@ def test_editing_keeps_both_together(tmp_path, plastic):
     edit(folder, tmp_path / "painted", base_color=(0.2, 0.1, 0.1))
     painted = load_asset(tmp_path / "painted").material
     expected = base_colour(painted.diffuse, painted.roughness, painted.specular, painted.ior)
-    np.testing.assert_allclose(expected, np.broadcast_to(painted.base_color, expected.shape), atol=0.01)
+    np.testing.assert_allclose(
+        expected, np.broadcast_to(painted.base_color, expected.shape), atol=0.01
+    )
 
 
 def test_the_recipe_fills_both(plastic, tmp_path):
     from pathlib import Path
 
-    from relit.fit.flash import assemble
+    from relit.fit.flash.recipe import assemble
     from relit.scene import Capture, Photo, Sphere
 
     m = plastic.material
-    maps = {"diffuse": m.diffuse, "specular": m.specular, "alpha": m.roughness**2, "normal": m.normal}
+    maps = {
+        "diffuse": m.diffuse,
+        "specular": m.specular,
+        "alpha": m.roughness**2,
+        "normal": m.normal,
+    }
     maps |= {"offset": np.zeros(3), "intensity": np.ones(1)}
     photo = Photo("a.png", None, 48, 48, plastic.cameras[0][1])
     capture = Capture(Path("."), "test", (photo,), sphere=Sphere(np.zeros(3), 1.0))

@@ -6,8 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.cameras.duplicates import LEAST, STEP, best_turn, find_features, link_instances, map_instances, match_pair
-from relit.cameras.se3 import exp_so3, rotation_angle
+from relit.cameras.rotation_sweep import (
+    LEAST,
+    STEP,
+    best_turn,
+    find_features,
+    link_instances,
+    map_instances,
+    match_pair,
+)
+from relit.geometry.se3 import exp_so3, rotation_angle
 from relit.scene import Camera
 
 
@@ -26,7 +34,12 @@ def disc(size=150):
 
 def turned(picture, degrees):
     centre = (picture.shape[1] / 2 - 0.5, picture.shape[0] / 2 - 0.5)
-    return cv2.warpAffine(picture, cv2.getRotationMatrix2D(centre, degrees, 1.0), picture.shape[1::-1], flags=cv2.INTER_CUBIC)
+    return cv2.warpAffine(
+        picture,
+        cv2.getRotationMatrix2D(centre, degrees, 1.0),
+        picture.shape[1::-1],
+        flags=cv2.INTER_CUBIC,
+    )
 
 
 def test_the_count_is_smoothed_around_the_circle():
@@ -51,7 +64,8 @@ def test_turned_matches_are_found_by_the_sweep_and_come_back_in_photo_pixels():
 
 
 def test_objects_of_one_scene_are_linked_and_placed():
-    """Three bumpy reliefs with one texture, turned against each other: relative rotations from one photo."""
+    """Three bumpy reliefs with one texture, turned against each other: relative rotations from one
+    photo."""
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (200, 3)) * [1, 1, 0.4]
     camera = Camera(1200, 400, 900.0, 900.0, 600.0, 200.0, np.eye(4))
@@ -62,9 +76,15 @@ def test_objects_of_one_scene_are_linked_and_placed():
     noise = [rng.normal(size=(200, 128)).astype(np.float32) for _ in range(8)]
     for k, turn in enumerate(turns):
         seen = camera.project(points @ turn.T + [3.0 * (k - 1), 0, 12])[:, :2]
-        swept = np.stack([n / np.linalg.norm(n, axis=1, keepdims=True) for n in noise[:1] * (360 // STEP)])
+        swept = np.stack(
+            [n / np.linalg.norm(n, axis=1, keepdims=True) for n in noise[:1] * (360 // STEP)]
+        )
         swept[[0, 3, 87]] = descriptors  # what a turn of about 0 shows; all others do not match
-        features.append(type(find_features(np.zeros((8, 8, 3), np.float32), np.ones((8, 8), np.float32), (0, 0)))(seen, swept))
+        features.append(
+            type(
+                find_features(np.zeros((8, 8, 3), np.float32), np.ones((8, 8), np.float32), (0, 0))
+            )(seen, swept)
+        )
     links = link_instances(features, camera, 1.0)
     assert set(links) == {(0, 1), (0, 2), (1, 2)} and min(len(x.a) for x in links.values()) >= LEAST
     placed = map_instances(features, links, camera)[0]

@@ -5,10 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relit.cameras.duplicates import STEP, Features, Link
-from relit.cameras.guided import adjusted, agreeing, guided, guided_links, midpoints, relative_turn, tracks_of
-from relit.cameras.se3 import exp_so3, rotation_angle
+from relit.cameras.guided import (
+    adjusted,
+    agreeing,
+    guided,
+    guided_links,
+    midpoints,
+    relative_turn,
+    tracks_of,
+)
+from relit.cameras.rotation_sweep import STEP, Features, Link
 from relit.conventions import move_points, similarity
+from relit.geometry.se3 import exp_so3, rotation_angle
 from relit.scene import Camera
 
 CAMERA = Camera(1600, 1200, 2300.0, 2300.0, 800.0, 600.0, np.eye(4))
@@ -16,12 +24,16 @@ TURNS = 360 // STEP
 
 
 def scene(noise_degrees=1.5, seed=0):
-    """Four objects of 120 points, half of them on the side that all see; their true poses, and wrong ones."""
+    """Four objects of 120 points, half of them on the side that all see; their true poses, and
+    wrong ones."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(120, 3))
     points = 0.8 * points / np.linalg.norm(points, axis=1, keepdims=True)
     axes = [np.array(a) for a in ([0.0, 0, 0], [0.5, 0.2, 0], [-0.3, 0.5, 0], [0.1, -0.6, 0])]
-    rolls, places = [0.0, 1.4, -2.2, 2.9], [[-2, -1.0, 11], [2, -1, 12], [-2, 1.2, 12.5], [2, 1.2, 11.5]]
+    rolls, places = (
+        [0.0, 1.4, -2.2, 2.9],
+        [[-2, -1.0, 11], [2, -1, 12], [-2, 1.2, 12.5], [2, 1.2, 11.5]],
+    )
     true, wrong = [], []
     for a, roll, at in zip(axes, rolls, places, strict=True):
         turn = exp_so3(np.array([0, 0, roll])) @ exp_so3(a)
@@ -32,7 +44,10 @@ def scene(noise_degrees=1.5, seed=0):
     features = []
     for pose, roll in zip(true, rolls, strict=True):
         seen = np.flatnonzero(points @ pose[:3, 3] > 2.5)
-        pixels = CAMERA.project(move_points(np.linalg.inv(pose), points[seen]))[:, :2] + rng.normal(size=(len(seen), 2)) * 0.3
+        pixels = (
+            CAMERA.project(move_points(np.linalg.inv(pose), points[seen]))[:, :2]
+            + rng.normal(size=(len(seen), 2)) * 0.3
+        )
         d = np.zeros((TURNS, len(seen), 128), np.float32)
         for t in range(TURNS):  # alike only at the turn that the object really has
             off = (t * STEP - np.degrees(roll) + 180) % 360 - 180
@@ -46,7 +61,11 @@ def pair_errors(poses, true):
     def between(p, i, j):
         return p[i][:3, :3].T @ p[j][:3, :3]
 
-    return [rotation_angle(between(poses, i, j).T @ between(true, i, j)) for j in range(len(poses)) for i in range(j)]
+    return [
+        rotation_angle(between(poses, i, j).T @ between(true, i, j))
+        for j in range(len(poses))
+        for i in range(j)
+    ]
 
 
 def test_the_turn_between_two_poses_is_that_of_their_pictures():
@@ -54,7 +73,9 @@ def test_the_turn_between_two_poses_is_that_of_their_pictures():
     for degrees in (35.0, 250.0):
         rolled = exp_so3(np.array([0, 0, np.radians(degrees)])) @ exp_so3(np.array([0.4, 0, 0]))
         other = np.linalg.inv(similarity(rolled, np.array([0, 0, 9.0])))
-        assert relative_turn(upright, other) == pytest.approx(degrees, abs=0.5)  # about +z away from the camera: clockwise in the picture
+        assert relative_turn(upright, other) == pytest.approx(
+            degrees, abs=0.5
+        )  # about +z away from the camera: clockwise in the picture
     assert relative_turn(upright, upright) == pytest.approx(0, abs=1e-6)
 
 
@@ -88,7 +109,9 @@ def test_guided_matches_are_right_and_adjustment_lowers_the_error():
 def test_matches_that_the_poses_forbid_are_left_out():
     features, true, _, _ = scene()
     n = min(len(features[0].points), len(features[1].points))
-    links = {(0, 1): Link(np.arange(n), np.arange(n)[::-1].copy(), 0.0)}  # keypoints paired at random
+    links = {
+        (0, 1): Link(np.arange(n), np.arange(n)[::-1].copy(), 0.0)
+    }  # keypoints paired at random
     kept = agreeing(features, links, true, [CAMERA] * 4)
     assert not kept or len(kept[0, 1].a) < 0.5 * n
     bare = [Features(f.points, np.zeros((0, 0, 0), np.float32)) for f in features]
@@ -98,5 +121,9 @@ def test_matches_that_the_poses_forbid_are_left_out():
 
 def test_tracks_hold_one_keypoint_of_an_instance():
     one = Link(np.array([0, 1, 2]), np.array([0, 1, 2]), 0.0)
-    links = {(0, 1): one, (1, 2): Link(np.array([0, 1]), np.array([5, 6]), 0.0), (0, 2): Link(np.array([0, 1]), np.array([5, 7]), 0.0)}
+    links = {
+        (0, 1): one,
+        (1, 2): Link(np.array([0, 1]), np.array([5, 6]), 0.0),
+        (0, 2): Link(np.array([0, 1]), np.array([5, 7]), 0.0),
+    }
     assert sorted(tracks_of(links)) == [[(0, 0), (1, 0), (2, 5)], [(0, 2), (1, 2)]]

@@ -8,16 +8,19 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.cameras.duplicates import Features
 from relit.cameras.matcher import keypoints, link_by_matcher, load_matcher, matches_at, turned
-from relit.cameras.se3 import exp_so3, rotation_angle
+from relit.cameras.rotation_sweep import Features
 from relit.errors import UserError
+from relit.geometry.se3 import exp_so3, rotation_angle
 from relit.scene import Camera
 
 
 def corners(a, b):
     """Matches the brightest pixel of each of the three channels."""
-    out = [np.array([np.unravel_index(x[..., c].argmax(), x.shape[:2])[::-1] for c in range(3)]) + 0.5 for x in (a, b)]
+    out = [
+        np.array([np.unravel_index(x[..., c].argmax(), x.shape[:2])[::-1] for c in range(3)]) + 0.5
+        for x in (a, b)
+    ]
     return out[0], out[1]
 
 
@@ -46,9 +49,14 @@ def test_a_matcher_links_two_objects(monkeypatch):
     points = rng.uniform(-1, 1, (60, 3)) * [1, 1, 0.4]
     camera = Camera(1200, 400, 900.0, 900.0, 600.0, 200.0, np.eye(4))
     turns = [np.eye(3), exp_so3(np.array([0.3, 0.35, 0.0]))]
-    seen = [camera.project(points @ t.T + [4.0 * (k - 0.5), 0, 12])[:, :2] for k, t in enumerate(turns)]
+    seen = [
+        camera.project(points @ t.T + [4.0 * (k - 0.5), 0, 12])[:, :2] for k, t in enumerate(turns)
+    ]
     corner = [s.min(0) - 10 for s in seen]
-    windows = [(np.full((170, 170, 3), 0.4, np.float32), np.ones((170, 170), np.float32), c) for c in corner]
+    windows = [
+        (np.full((170, 170, 3), 0.4, np.float32), np.ones((170, 170), np.float32), c)
+        for c in corner
+    ]
     import relit.cameras.matcher as module
 
     scale = module.SIDE / 170
@@ -65,7 +73,9 @@ def test_a_matcher_links_two_objects(monkeypatch):
     assert set(links) == {(0, 1)} and isinstance(features[0], Features) and 15 < len(calls) < 25
     calls.clear()
     fine = link_by_matcher(None, windows, [camera, camera], 1.0, step=4)[1]
-    assert {float(t) for t in range(0, 360, 4)} <= set(calls) and len(calls) < 96  # each turn is asked for once
+    assert {float(t) for t in range(0, 360, 4)} <= set(calls) and len(
+        calls
+    ) < 96  # each turn is asked for once
     assert abs((fine[0, 1].turn + 180) % 360 - 180) < 20 and len(fine[0, 1].a) == len(links[0, 1].a)
     link = links[0, 1]
     assert np.abs(features[0].points[link.a] - seen[0][: len(link.a)]).max() < 1.0
@@ -76,21 +86,28 @@ def test_the_step_is_a_setting_of_the_recipe(monkeypatch):
     from types import SimpleNamespace
 
     import relit.cameras.matcher as module
-    from relit.fit import duplicates_poses
-    from relit.fit.duplicates_options import DuplicatesOptions
+    from relit.fit.duplicates import poses as duplicates_poses
+    from relit.fit.duplicates.options import DuplicatesOptions
 
     def link(matcher, windows, cameras, error, *, sweep, step):
         steps.append(step)
         raise StopIteration
 
     steps = []
-    view = SimpleNamespace(photo=0, camera=Camera(8, 8, 9.0, 9.0, 4, 4, np.eye(4)), rgb=np.zeros((8, 8, 3)), mask=np.ones((8, 8)))
+    view = SimpleNamespace(
+        photo=0,
+        camera=Camera(8, 8, 9.0, 9.0, 4, 4, np.eye(4)),
+        rgb=np.zeros((8, 8, 3)),
+        mask=np.ones((8, 8)),
+    )
     monkeypatch.setattr(module, "link_by_matcher", link)
     monkeypatch.setattr(module, "load_matcher", lambda name: None)
     monkeypatch.setattr(duplicates_poses, "all_views", lambda *_: [view])
     for given, step in (({}, 24), ({"matcher_step": 4}, 4)):
         with pytest.raises(StopIteration):
-            duplicates_poses.match_instances([(None, view.camera)], None, DuplicatesOptions(matcher="a:b", **given), 0)
+            duplicates_poses.match_instances(
+                [(None, view.camera)], None, DuplicatesOptions(matcher="a:b", **given), 0
+            )
         assert steps.pop() == step
     for wrong in (0, 7, 100):
         with pytest.raises(ValueError, match="divisor"):
@@ -98,7 +115,9 @@ def test_the_step_is_a_setting_of_the_recipe(monkeypatch):
 
 
 def test_matchers_are_loaded_by_name(tmp_path, monkeypatch):
-    (tmp_path / "my_matcher_for_tests.py").write_text("def match(a, b):\n    return [[1, 2]], [[3, 4], [5, 6]]\nnumber = 3\n")
+    (tmp_path / "my_matcher_for_tests.py").write_text(
+        "def match(a, b):\n    return [[1, 2]], [[3, 4], [5, 6]]\nnumber = 3\n"
+    )
     monkeypatch.chdir(tmp_path)
     match = load_matcher("my_matcher_for_tests:match")
     with pytest.raises(UserError, match="the matcher failed"):

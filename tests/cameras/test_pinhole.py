@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relit.cameras.pinhole import (
+from relit.geometry.lens import (
     BrownLens,
     FisheyeLens,
     ideal_from_pixels,
@@ -25,7 +25,14 @@ def camera(distortion=(), width=60, height=40):
     return Camera(width, height, 70.0, 72.0, 29.0, 21.0, np.eye(4), tuple(distortion))
 
 
-@pytest.mark.parametrize("k", [(0.1, -0.2, 0.01, -0.02), (0.1, -0.2, 0.01, -0.02, 0.05), (0.1, 0.2, 0.0, 0.0, 0.05, 0.2, -0.1, 0.02)])
+@pytest.mark.parametrize(
+    "k",
+    [
+        (0.1, -0.2, 0.01, -0.02),
+        (0.1, -0.2, 0.01, -0.02, 0.05),
+        (0.1, 0.2, 0.0, 0.0, 0.05, 0.2, -0.1, 0.02),
+    ],
+)
 def test_brown_is_opencv(k):
     c = camera(k)
     points = np.concatenate([XY, np.ones((50, 1))], axis=1)
@@ -53,11 +60,14 @@ def test_undistorted_pictures_have_no_blank_pixels(k):
 def test_inverse_of_the_lens():
     c = camera((-0.2, 0.05, 0.001, 0.002))
     lens = lens_of(c)
-    np.testing.assert_allclose(ideal_from_pixels(c, lens, pixels_from_ideal(c, lens, XY)), XY, atol=1e-4)
+    np.testing.assert_allclose(
+        ideal_from_pixels(c, lens, pixels_from_ideal(c, lens, XY)), XY, atol=1e-4
+    )
 
 
 def test_the_map_agrees_with_projection():
-    """A world point that projects to some pixel of the undistorted picture is found where the lens put it in the photo."""
+    """A world point that projects to some pixel of the undistorted picture is found where the lens
+    put it in the photo."""
     c = camera((-0.1, 0.02, 0.002, -0.001))
     lens = lens_of(c)
     ideal = undistorted_camera(c, lens)
@@ -65,7 +75,9 @@ def test_the_map_agrees_with_projection():
     row, col = 11, 37
     point = np.array([(col + 0.5 - ideal.cx) / ideal.fx, (row + 0.5 - ideal.cy) / ideal.fy, 1.0])
     np.testing.assert_allclose(ideal.project(point)[:2], [col + 0.5, row + 0.5])
-    seen, _ = cv2.projectPoints(point[None], np.zeros(3), np.zeros(3), c.intrinsics, np.array(c.distortion))
+    seen, _ = cv2.projectPoints(
+        point[None], np.zeros(3), np.zeros(3), c.intrinsics, np.array(c.distortion)
+    )
     np.testing.assert_allclose([x[row, col] + 0.5, y[row, col] + 0.5], seen[0, 0], atol=1e-5)
 
 

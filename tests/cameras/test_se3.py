@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relit.cameras import se3
 from relit.conventions import move_points, move_pose, similarity
+from relit.geometry import se3
 
 numbers = st.floats(-3, 3, allow_nan=False)
 vectors = st.tuples(numbers, numbers, numbers).map(np.array)
@@ -45,9 +45,13 @@ def test_half_turns_and_tiny_turns(axis):
 @settings(max_examples=30, deadline=None)
 def test_alignment_recovers_a_similarity(seed):
     rng = np.random.default_rng(seed)
-    b_from_a = similarity(se3.exp_so3(rng.normal(size=3)), rng.normal(size=3) * 4, np.exp(rng.normal()))
+    b_from_a = similarity(
+        se3.exp_so3(rng.normal(size=3)), rng.normal(size=3) * 4, np.exp(rng.normal())
+    )
     points = rng.normal(size=(6, 3))
-    np.testing.assert_allclose(se3.umeyama(points, move_points(b_from_a, points)), b_from_a, atol=1e-8)
+    np.testing.assert_allclose(
+        se3.umeyama(points, move_points(b_from_a, points)), b_from_a, atol=1e-8
+    )
     poses = np.stack([random_pose(rng) for _ in range(5)])
     moved = np.stack([move_pose(b_from_a, p) for p in poses])
     np.testing.assert_allclose(se3.align_cameras(poses, moved), b_from_a, atol=1e-8)
@@ -61,7 +65,9 @@ def test_alignment_of_cameras_on_a_line():
     poses = np.stack([random_pose(rng) for _ in range(4)])
     poses[:, :3, 3] = np.outer(np.arange(4), [1.0, 2.0, 3.0])
     b_from_a = similarity(se3.exp_so3([0.4, -1, 0.2]), [1, 2, 3], 2.5)
-    np.testing.assert_allclose(se3.align_cameras(poses, [move_pose(b_from_a, p) for p in poses]), b_from_a, atol=1e-9)
+    np.testing.assert_allclose(
+        se3.align_cameras(poses, [move_pose(b_from_a, p) for p in poses]), b_from_a, atol=1e-9
+    )
 
 
 def test_one_wrong_camera_is_reported_and_does_not_move_the_others():

@@ -10,10 +10,10 @@ import pytest
 
 from relit import images
 from relit.cameras import sfm
-from relit.cameras.se3 import camera_errors, look_at
 from relit.cameras.sfm import find_cameras
-from relit.capture import open_capture
+from relit.capture.open import open_capture
 from relit.errors import EXIT_FAILED, UserError
+from relit.geometry.se3 import camera_errors, look_at
 from relit.scene import Camera
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 240.0
@@ -24,7 +24,14 @@ CORNER = np.array([-1.0, 1.0, 1.0])
 
 def texture(seed):
     rng = np.random.default_rng(seed)
-    layers = [cv2.resize(rng.uniform(size=(n, n, 3)).astype(np.float32), (512, 512), interpolation=cv2.INTER_CUBIC) for n in (16, 48, 128)]
+    layers = [
+        cv2.resize(
+            rng.uniform(size=(n, n, 3)).astype(np.float32),
+            (512, 512),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        for n in (16, 48, 128)
+    ]
     return np.clip(sum(layers) / 3 * 1.6 - 0.3, 0, 1)
 
 
@@ -32,17 +39,25 @@ TEXTURES = [texture(i) for i in range(3)]
 
 
 def photo(camera):
-    """The planes x = -1, y = 1 (below) and z = 1, each 4 x 4, with a texture on it: linear (H, W, 3), and a mask of its corner (H, W)."""
-    gx, gy = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy)
+    """The planes x = -1, y = 1 (below) and z = 1, each 4 x 4, with a texture on it: linear (H, W,
+    3), and a mask of its corner (H, W)."""
+    gx, gy = np.meshgrid(
+        (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
+        (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
+    )
     d = np.stack([gx, gy, np.ones_like(gx)], -1) @ camera.world_from_camera[:3, :3].T
     rgb, depth = np.full((*gx.shape, 3), 0.2, np.float32), np.full(gx.shape, np.inf)
     for axis, level in ((0, -1.0), (1, 1.0), (2, 1.0)):
-        t = (level - camera.centre[axis]) / np.where(np.abs(d[..., axis]) < 1e-9, 1e-9, d[..., axis])
+        t = (level - camera.centre[axis]) / np.where(
+            np.abs(d[..., axis]) < 1e-9, 1e-9, d[..., axis]
+        )
         p = camera.centre + t[..., None] * d
         u, v = (np.delete(p, axis, axis=-1)[..., i] for i in (0, 1))
         hit = (t > 0) & (t < depth) & (np.abs(u) < 2) & (np.abs(v) < 2)
         xy = [((c + 2) * 127.9).astype(np.float32) for c in (u, v)]
-        rgb[hit] = cv2.remap(TEXTURES[axis], *xy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[hit]
+        rgb[hit] = cv2.remap(
+            TEXTURES[axis], *xy, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )[hit]
         depth[hit] = t[hit]
     points = camera.centre + np.where(np.isfinite(depth), depth, 1e6)[..., None] * d
     return rgb, (np.linalg.norm(points - CORNER, axis=-1) < 1.5).astype(np.float32)
@@ -74,29 +89,43 @@ def test_a_textured_corner(folder, tmp_path):
     assert capture.photos[0].load().mask.mean() > 0.2
     found, verdict = find_cameras(capture, workdir=tmp_path)
     assert any("found from the masks" in n for n in found.notes)
-    assert verdict.registered == verdict.total == 6 and verdict.reason == "" and verdict.mean_error < 1.0
+    assert (
+        verdict.registered == verdict.total == 6
+        and verdict.reason == ""
+        and verdict.mean_error < 1.0
+    )
     assert found.has_cameras and found.sphere is not None and len(found.points) > 50
     poses = np.stack([p.camera.world_from_camera for p in found.photos])
     angle, distance = camera_errors(poses, np.stack([c.world_from_camera for c in truth]))
     inside = np.linalg.norm(found.points - np.median(found.points, axis=0), axis=1)
-    assert np.quantile(inside, 0.95) < 1.2 * found.sphere.radius  # features off the masks are not used
+    assert (
+        np.quantile(inside, 0.95) < 1.2 * found.sphere.radius
+    )  # features off the masks are not used
     assert np.median(angle) < 0.5 and np.median(distance) < 0.05
     assert found.photos[0].camera.fx == pytest.approx(FOCAL, rel=0.05)
     assert found.photos[0].load().rgb.shape == (found.photos[0].height, found.photos[0].width, 3)
 
     again, same = find_cameras(capture, workdir=tmp_path)  # read back, not searched again
     assert same == verdict
-    np.testing.assert_array_equal(again.photos[3].camera.world_from_camera, found.photos[3].camera.world_from_camera)
+    np.testing.assert_array_equal(
+        again.photos[3].camera.world_from_camera, found.photos[3].camera.world_from_camera
+    )
 
 
-def test_a_fixed_focal_stays_and_strangers_are_left_out_with_a_reason(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(sfm, "EXHAUSTIVE", 3)  # matched along the order of names, as a large capture is
+def test_a_fixed_focal_stays_and_strangers_are_left_out_with_a_reason(
+    folder, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(
+        sfm, "EXHAUSTIVE", 3
+    )  # matched along the order of names, as a large capture is
     room = tmp_path / "room"
     room.mkdir()
     for i in range(1, 5):
         (room / f"{i}.png").write_bytes((folder / "images" / f"{i}.png").read_bytes())
     images.write_srgb(room / "blank.png", np.full((HEIGHT, WIDTH, 3), 0.4))
-    found, verdict = find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 5)
+    found, verdict = find_cameras(
+        open_capture(room, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 5
+    )
     assert (verdict.registered, verdict.total) == (4, 5)
     assert "1 have fewer than 150 features" in verdict.reason and "blank.png" in verdict.reason
     assert str(verdict).startswith("4 of 5 photos registered, because ")
@@ -121,18 +150,35 @@ def test_four_photos_of_forty_are_no_capture(folder, tmp_path):
     for i in range(36):
         images.write_srgb(room / f"blank{i}.png", np.full((HEIGHT, WIDTH, 3), 0.4))
     with pytest.raises(UserError, match="too few cameras were found: 4 of 40") as caught:
-        find_cameras(open_capture(room, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 40)
-    assert caught.value.code == EXIT_FAILED and "36 have fewer than 150 features" in caught.value.why
+        find_cameras(
+            open_capture(room, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 40
+        )
+    assert (
+        caught.value.code == EXIT_FAILED and "36 have fewer than 150 features" in caught.value.why
+    )
 
 
 def test_photos_that_look_apart_are_told_so_without_advice_about_given_poses(tmp_path):
-    for i, x in enumerate(np.linspace(-0.5, 1.0, 5)):  # a walk along a wall, each photo turned away from the middle
+    for i, x in enumerate(
+        np.linspace(-0.5, 1.0, 5)
+    ):  # a walk along a wall, each photo turned away from the middle
         eye = np.array([x, 0.0, -1.0])
         pose = look_at(eye, [x + 0.5 * (x - 0.25), 0.0, 1.0], [0, -1, 0])
-        images.write_srgb(tmp_path / f"{i}.png", photo(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))[0])
-    with pytest.raises(UserError, match=r"look away from each other.*found from the photos") as caught:
-        find_cameras(open_capture(tmp_path, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 5)
-    assert caught.value.code == EXIT_FAILED and "do not go around one object" in caught.value.why and "--sphere" not in caught.value.fix
+        images.write_srgb(
+            tmp_path / f"{i}.png",
+            photo(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))[0],
+        )
+    with pytest.raises(
+        UserError, match=r"look away from each other.*found from the photos"
+    ) as caught:
+        find_cameras(
+            open_capture(tmp_path, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 5
+        )
+    assert (
+        caught.value.code == EXIT_FAILED
+        and "do not go around one object" in caught.value.why
+        and "--sphere" not in caught.value.fix
+    )
 
 
 def test_two_photos_are_too_few(folder, tmp_path):
@@ -142,6 +188,7 @@ def test_two_photos_are_too_few(folder, tmp_path):
 
 
 def test_pycolmap_does_not_break_zlib():
-    """Without the guard in `relit/__init__.py` this aborts: pycolmap's zlib symbols take the place of libz's."""
+    """Without the guard in `relit/__init__.py` this aborts: pycolmap's zlib symbols take the place
+    of libz's."""
     code = "import relit, pycolmap, zlib; data = bytes(range(256)) * 8192; assert zlib.decompress(zlib.compress(data, 4)) == data"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3, look_at
 from relit.cameras.strays import LEAST_POINTS, shown, stray_photos
 from relit.conventions import similarity
-from relit.fit.register import directions_around
+from relit.fit.registration.register import directions_around
+from relit.geometry.se3 import exp_so3, look_at
 from relit.scene import Camera
 
 SIDE = 256
@@ -68,7 +68,10 @@ def test_nobody_is_blamed_where_little_is_known(seen):
     rough = [np.roll(m, 56, axis=1) for m in masks]  # masks that hold little of it anywhere
     assert stray_photos(wrong, rough, points)[0] == []
     turned = exp_so3(np.array([0.0, 0.0, 1.2]))
-    half = [camera(similarity(turned @ c.world_from_camera[:3, :3], turned @ c.centre)) if k % 2 else c for k, c in enumerate(cameras)]
+    half = [
+        camera(similarity(turned @ c.world_from_camera[:3, :3], turned @ c.centre)) if k % 2 else c
+        for k, c in enumerate(cameras)
+    ]
     assert stray_photos(half, masks, points)[0] == []
 
 
@@ -78,13 +81,23 @@ def test_a_close_up_is_no_stray(seen):
     cameras, masks = list(cameras), list(masks)
     cut = SIDE // 2
     c = cameras[5]
-    cameras[5], masks[5] = Camera(cut, SIDE, c.fx, c.fy, c.cx, c.cy, c.world_from_camera), masks[5][:, :cut]
+    cameras[5], masks[5] = (
+        Camera(cut, SIDE, c.fx, c.fy, c.cx, c.cy, c.world_from_camera),
+        masks[5][:, :cut],
+    )
     assert stray_photos(cameras, masks, points)[0] == []
     away = c.world_from_camera.copy()
     away[:3, :3] = away[:3, :3] @ exp_so3(np.array([0.0, 1.5, 0.0]))  # sees nothing of it
     full = np.ones((SIDE, SIDE), np.float32)  # whose mask reaches the border: nothing to judge by
-    assert stray_photos([*cameras[:5], camera(away), *cameras[6:]], [*masks[:5], full, *masks[6:]], points)[0] == []
-    assert stray_photos([*cameras[:5], camera(away), *cameras[6:]], seen[1], points)[0] == [5]  # whose mask shows all of the object
+    assert (
+        stray_photos(
+            [*cameras[:5], camera(away), *cameras[6:]], [*masks[:5], full, *masks[6:]], points
+        )[0]
+        == []
+    )
+    assert stray_photos([*cameras[:5], camera(away), *cameras[6:]], seen[1], points)[0] == [
+        5
+    ]  # whose mask shows all of the object
 
 
 def test_points_behind_or_beside_the_picture_are_not_shown(seen):
@@ -94,6 +107,13 @@ def test_points_behind_or_beside_the_picture_are_not_shown(seen):
     x, ahead = c.world_from_camera[:3, 0], c.world_from_camera[:3, 2]
     points = c.centre + np.array([2 * ahead, -2 * ahead, 2 * ahead + 5 * x, 2 * ahead - 0.3 * x])
     inside, held = shown(c, mask, points)
-    assert inside.tolist() == [True, False, False, True] and held.tolist() == [True, False, False, False]
+    assert inside.tolist() == [True, False, False, True] and held.tolist() == [
+        True,
+        False,
+        False,
+        False,
+    ]
     mask[[0, -1]], mask[:, [0, -1]] = 0, 0
-    assert shown(c, mask, points)[0].all()  # all of it lies in the frame: where it does not, something is wrong
+    assert shown(c, mask, points)[
+        0
+    ].all()  # all of it lies in the frame: where it does not, something is wrong

@@ -1,4 +1,5 @@
-"""Small pictures with known cameras: three coloured balls on the axes of the world, and writers of the camera formats."""
+"""Small pictures with known cameras: three coloured balls on the axes of the world, and writers of
+the camera formats."""
 
 import json
 from dataclasses import replace
@@ -6,32 +7,50 @@ from dataclasses import replace
 import numpy as np
 
 from relit import images
-from relit.cameras.se3 import look_at
 from relit.conventions import world_from_gl_camera
+from relit.geometry.se3 import look_at
 from relit.scene import Camera
 
-BALLS = {(0.6, 0, 0): (1, 0.05, 0.05), (0, 0.6, 0): (0.05, 1, 0.05), (0, 0, 0.6): (0.05, 0.05, 1)}  # centre -> linear colour
+BALLS = {
+    (0.6, 0, 0): (1, 0.05, 0.05),
+    (0, 0.6, 0): (0.05, 1, 0.05),
+    (0, 0, 0.6): (0.05, 0.05, 1),
+}  # centre -> linear colour
 RADIUS = 0.22
 BACKGROUND = (0.3, 0.5, 0.2)  # linear, of photos without masks
 EXTENT = 0.82  # of the three balls about the origin
 
 
 def ring(count=6, width=72, height=56, distance=4.0, focal=100.0, centred=False):
-    """Cameras on an upward spiral around the origin; the principal point is off the middle unless `centred`."""
+    """Cameras on an upward spiral around the origin; the principal point is off the middle unless
+    `centred`."""
     out = []
     for i in range(count):
         a = 2 * np.pi * i / count + 0.3
         eye = distance * np.array([np.cos(a), 0.25 + 0.1 * np.sin(2 * a), np.sin(a)])
         cx, cy = (width / 2, height / 2) if centred else (width / 2 + 1.5, height / 2 - 2.25)
-        out.append(Camera(width, height, focal, focal if centred else focal * 1.02, cx, cy, look_at(eye, [0, 0, 0])))
+        out.append(
+            Camera(
+                width,
+                height,
+                focal,
+                focal if centred else focal * 1.02,
+                cx,
+                cy,
+                look_at(eye, [0, 0, 0]),
+            )
+        )
     return out
 
 
 def picture(camera, samples=2):
-    """(rgb premultiplied linear (H, W, 3), alpha (H, W)) of the balls, without shading, `samples`^2 rays a pixel."""
+    """(rgb premultiplied linear (H, W, 3), alpha (H, W)) of the balls, without shading, `samples`^2
+    rays a pixel."""
     w, h = camera.width * samples, camera.height * samples
     big = camera.resized(w, h)
-    gx, gy = np.meshgrid((np.arange(w) + 0.5 - big.cx) / big.fx, (np.arange(h) + 0.5 - big.cy) / big.fy)
+    gx, gy = np.meshgrid(
+        (np.arange(w) + 0.5 - big.cx) / big.fx, (np.arange(h) + 0.5 - big.cy) / big.fy
+    )
     d = np.stack([gx, gy, np.ones_like(gx)], -1) @ camera.world_from_camera[:3, :3].T
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
     rgb, depth = np.zeros((h, w, 3), np.float32), np.full((h, w), np.inf)
@@ -66,7 +85,8 @@ def write_photos(folder, cameras, suffix=".png", alpha=False, background=None, s
 
 
 def check_projection(photo):
-    """Each ball's centre, projected by the photo's camera, falls on a pixel of that ball's colour unless another ball hides it."""
+    """Each ball's centre, projected by the photo's camera, falls on a pixel of that ball's colour
+    unless another ball hides it."""
     rgb, seen = photo.load().rgb, 0
     for centre, colour in BALLS.items():
         x, y, z = photo.camera.project(np.asarray(centre))
@@ -74,7 +94,13 @@ def check_projection(photo):
         found = rgb[int(y), int(x)]
         expected = np.asarray(colour)
         hidden = any(
-            np.linalg.norm(np.cross(np.asarray(c) - photo.camera.centre, np.asarray(centre) - photo.camera.centre)) / z < 1.3 * RADIUS
+            np.linalg.norm(
+                np.cross(
+                    np.asarray(c) - photo.camera.centre, np.asarray(centre) - photo.camera.centre
+                )
+            )
+            / z
+            < 1.3 * RADIUS
             and photo.camera.project(np.asarray(c))[2] < z
             for c in BALLS
             if c != centre
@@ -97,7 +123,10 @@ def same_camera(a, b, atol=1e-6):
 def write_transforms(root, cameras, names, file="transforms.json", per_frame=False, **extra):
     frames = []
     for camera, name in zip(cameras, names, strict=True):
-        frame = {"file_path": name, "transform_matrix": world_from_gl_camera(camera.world_from_camera).tolist()}
+        frame = {
+            "file_path": name,
+            "transform_matrix": world_from_gl_camera(camera.world_from_camera).tolist(),
+        }
         if per_frame:
             frame |= intrinsics_json(camera)
         frames.append(frame)
@@ -121,13 +150,18 @@ def write_colmap_text(folder, cameras, names, model="PINHOLE", extra=(), points=
     rows, poses = [], []
     for i, (c, name) in enumerate(zip(cameras, names, strict=True), start=1):
         head = [c.fx, c.cx, c.cy] if model.startswith("SIMPLE") else [c.fx, c.fy, c.cx, c.cy]
-        rows.append(f"{i} {model} {c.width} {c.height} " + " ".join(repr(float(v)) for v in [*head, *extra]))
+        rows.append(
+            f"{i} {model} {c.width} {c.height} " + " ".join(repr(float(v)) for v in [*head, *extra])
+        )
         q = quaternion(c.camera_from_world[:3, :3])
         values = " ".join(repr(float(v)) for v in [*q, *c.camera_from_world[:3, 3]])
         poses.append(f"{i} {values} {i} {name}\n")
     (folder / "cameras.txt").write_text("\n".join(rows) + "\n")
     (folder / "images.txt").write_text("\n".join(poses) + "\n")
-    lines = [f"{i} {x!r} {y!r} {z!r} 0 0 0 0.5" for i, (x, y, z) in enumerate(np.asarray(points).reshape(-1, 3).tolist(), start=1)]
+    lines = [
+        f"{i} {x!r} {y!r} {z!r} 0 0 0 0.5"
+        for i, (x, y, z) in enumerate(np.asarray(points).reshape(-1, 3).tolist(), start=1)
+    ]
     (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
 
 

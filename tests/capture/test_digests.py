@@ -7,8 +7,8 @@ import pytest
 import shots
 
 from relit import images
-from relit.capture import open_capture
-from relit.plan import input_digests
+from relit.capture.open import open_capture
+from relit.job import input_digests
 
 
 @pytest.fixture
@@ -29,7 +29,9 @@ def test_notes_and_logs_decide_nothing(tmp_path, cameras):
 def test_cameras_of_colmap_decide_wherever_they_lie(tmp_path, cameras, model):
     names = shots.write_photos(tmp_path / "images", cameras)
     shots.write_colmap_text(tmp_path / model, cameras, names)
-    assert {f"{model}/cameras.txt", f"{model}/images.txt", "images/000.png"} <= set(input_digests(open_capture(tmp_path)))
+    assert {f"{model}/cameras.txt", f"{model}/images.txt", "images/000.png"} <= set(
+        input_digests(open_capture(tmp_path))
+    )
 
 
 def test_masks_and_normal_priors_beside_the_photos_decide(tmp_path, cameras):
@@ -37,7 +39,10 @@ def test_masks_and_normal_priors_beside_the_photos_decide(tmp_path, cameras):
     for i, camera in enumerate(cameras):
         alpha = shots.picture(camera)[1]
         images.write_data(tmp_path / f"{i:03d}_mask.png", alpha)
-        images.write_data(tmp_path / f"{i:03d}_normal.png", np.stack([alpha * 0 + 0.5, alpha * 0 + 0.5, alpha * 0], -1))
+        images.write_data(
+            tmp_path / f"{i:03d}_normal.png",
+            np.stack([alpha * 0 + 0.5, alpha * 0 + 0.5, alpha * 0], -1),
+        )
     before = input_digests(open_capture(tmp_path))
     assert {"003.jpg", "003_mask.png", "003_normal.png"} <= set(before)
     images.write_data(tmp_path / "003_mask.png", shots.picture(cameras[3])[1] * 0.9)
@@ -49,7 +54,11 @@ def test_cameras_in_the_folder_of_a_split_decide(tmp_path, cameras):
     k = np.eye(4)
     k[:3, :3] = cameras[0].intrinsics
     entries = {
-        n: {"K": k.ravel().tolist(), "W2C": c.camera_from_world.ravel().tolist(), "img_size": [c.width, c.height]}
+        n: {
+            "K": k.ravel().tolist(),
+            "W2C": c.camera_from_world.ravel().tolist(),
+            "img_size": [c.width, c.height],
+        }
         for n, c in zip(names, cameras, strict=True)
     }
     (tmp_path / "train" / "cam_dict_norm.json").write_text(json.dumps(entries))

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.capture import open_capture
 from relit.capture.corrections import FOLDER, save_mask
+from relit.capture.open import open_capture
 from relit.errors import UserError
 from relit.masks.rle import runs_from
 
@@ -49,7 +49,9 @@ def test_sfd_folder_with_focal_as_text_and_a_photo_that_is_not_square(tmp_path):
     camera = capture.photos[0].camera
     assert capture.kind == "duplicates" and (camera.width, camera.height) == (W, H)
     assert camera.fx == 123.5 and camera.cx == W / 2
-    assert np.allclose(camera.centre, [1, 2, 3]) and np.allclose(camera.world_from_camera[:3, 2], [0, 0, -1])
+    assert np.allclose(camera.centre, [1, 2, 3]) and np.allclose(
+        camera.world_from_camera[:3, 2], [0, 0, -1]
+    )
     assert numbers(capture) == [0, 60, 100, 140] and capture.objects == 3
 
 
@@ -60,9 +62,13 @@ def test_normal_priors_in_the_axes_of_sfd_and_in_our_own(tmp_path):
     cv2.imwrite(str(folder / "train" / "000_normal_pretrain.png"), code)
     capture = open_capture(folder)
     normal = capture.photos[0].load().normal
-    assert np.allclose(normal[40, 50], [0, -0.6, -0.8], atol=0.01) and np.allclose(normal[90, 50], 0)
+    assert np.allclose(normal[40, 50], [0, -0.6, -0.8], atol=0.01) and np.allclose(
+        normal[90, 50], 0
+    )
     assert any("normal priors" in n for n in capture.notes)
-    cv2.imwrite(str(folder / "train" / "000_normal.png"), code)  # named as elsewhere: the photo's own axes
+    cv2.imwrite(
+        str(folder / "train" / "000_normal.png"), code
+    )  # named as elsewhere: the photo's own axes
     assert np.allclose(open_capture(folder).photos[0].load().normal[40, 50], seen, atol=0.01)
 
 
@@ -81,7 +87,9 @@ def test_a_photo_with_coloured_labels_beside_it(tmp_path):
     colours = np.stack([grey, grey // 2, np.where(grey > 0, 200, 0).astype(np.uint8)], -1)
     cv2.imwrite(str(tmp_path / "photo_labels.png"), colours)
     capture = open_capture(path)
-    assert len(numbers(capture)) == 4 and any("focal length is not known" in n for n in capture.notes)
+    assert len(numbers(capture)) == 4 and any(
+        "focal length is not known" in n for n in capture.notes
+    )
     assert open_capture(tmp_path).kind == "duplicates"
 
 
@@ -134,7 +142,10 @@ def test_cutouts(tmp_path):
     (tmp_path / "cutouts").mkdir()
     for k, value in enumerate((60, 100)):
         alpha = np.where(labels_of() == value, 255, 0).astype(np.uint8)
-        cv2.imwrite(str(tmp_path / "cutouts" / f"{k}.png"), np.dstack([np.zeros((H, W, 3), np.uint8), alpha]))
+        cv2.imwrite(
+            str(tmp_path / "cutouts" / f"{k}.png"),
+            np.dstack([np.zeros((H, W, 3), np.uint8), alpha]),
+        )
     assert numbers(open_capture(path)) == [0, 1, 2]
     cv2.imwrite(str(tmp_path / "cutouts" / "2.png"), np.zeros((20, 20, 4), np.uint8))
     with pytest.raises(UserError, match="does not fit the photo"):
@@ -152,12 +163,23 @@ def test_coco_polygons_and_run_lengths(tmp_path):
         {"image_id": 7, "segmentation": {"size": [H, W], "counts": runs}},
         {"image_id": 8, "segmentation": [[100, 30, 148, 30, 148, 66]]},
     ]
-    images = [{"id": 7, "file_name": "photo.png", "width": W, "height": H}, {"id": 8, "file_name": "other.png"}]
-    (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    images = [
+        {"id": 7, "file_name": "photo.png", "width": W, "height": H},
+        {"id": 8, "file_name": "other.png"},
+    ]
+    (tmp_path / "annotations.json").write_text(
+        json.dumps({"images": images, "annotations": annotations})
+    )
     labels = open_capture(path).photos[0].load().labels
-    assert ((labels == 2) == (mask > 0)).all() and labels[48, 30] == 1 and set(np.unique(labels)) == {0, 1, 2}
+    assert (
+        ((labels == 2) == (mask > 0)).all()
+        and labels[48, 30] == 1
+        and set(np.unique(labels)) == {0, 1, 2}
+    )
     annotations[1]["segmentation"]["counts"] = [5, 5]
-    (tmp_path / "annotations.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    (tmp_path / "annotations.json").write_text(
+        json.dumps({"images": images, "annotations": annotations})
+    )
     with pytest.raises(UserError, match="do not add up"):
         open_capture(path)
 
@@ -165,15 +187,37 @@ def test_coco_polygons_and_run_lengths(tmp_path):
 def test_coco_of_several_categories(tmp_path):
     path = photo(tmp_path)
     square = lambda x: [[x, 30, x + 36, 30, x + 36, 66, x, 66]]  # noqa: E731
-    kinds = [(3, square(12), 0), (5, [[0, 0, W, 0, W, H, 0, H]], 0), (3, square(60), 1)]  # of single objects some tools write iscrowd 1 too
-    annotations = [{"image_id": 7, "category_id": k, "segmentation": s, "iscrowd": crowd} for k, s, crowd in kinds]
-    annotations += [{"image_id": 8, "category_id": 5, "segmentation": square(12)}] * 4  # of a photo that is not here
-    images = [{"id": 7, "file_name": "photo.png", "width": W, "height": H}, {"id": 8, "file_name": "other.png"}]
-    data = {"images": images, "annotations": annotations, "categories": [{"id": 3, "name": "cup"}, {"id": 5, "name": "table"}, {"id": [5]}]}
+    kinds = [
+        (3, square(12), 0),
+        (5, [[0, 0, W, 0, W, H, 0, H]], 0),
+        (3, square(60), 1),
+    ]  # of single objects some tools write iscrowd 1 too
+    annotations = [
+        {"image_id": 7, "category_id": k, "segmentation": s, "iscrowd": crowd}
+        for k, s, crowd in kinds
+    ]
+    annotations += [
+        {"image_id": 8, "category_id": 5, "segmentation": square(12)}
+    ] * 4  # of a photo that is not here
+    images = [
+        {"id": 7, "file_name": "photo.png", "width": W, "height": H},
+        {"id": 8, "file_name": "other.png"},
+    ]
+    data = {
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": 3, "name": "cup"}, {"id": 5, "name": "table"}, {"id": [5]}],
+    }
     (tmp_path / "annotations.json").write_text(json.dumps(data))
     capture = open_capture(path)
     labels = capture.photos[0].load().labels
-    assert set(np.unique(labels)) == {0, 1, 2} and labels[40, 20] == 1 and labels[40, 70] == 2 and labels[40, 5] == 0 and labels[2, 2] == 0
+    assert (
+        set(np.unique(labels)) == {0, 1, 2}
+        and labels[40, 20] == 1
+        and labels[40, 70] == 2
+        and labels[40, 5] == 0
+        and labels[2, 2] == 0
+    )
     assert any("category cup, the commonest" in note for note in capture.notes)
     for k, annotation in enumerate(annotations[:3]):
         annotation["category_id"] = k  # one for each object
@@ -207,9 +251,15 @@ def test_several_photos_of_one_pile(tmp_path):
         cv2.imwrite(str(tmp_path / f"p{k}_labels.png"), labels_of(3 - k % 2))
     photo(tmp_path, "other.png")  # has no labels
     capture = open_capture(tmp_path, focal=150.0)
-    assert [p.name for p in capture.photos] == ["p0.png", "p1.png", "p2.png"] and capture.kind == "duplicates"
+    assert [p.name for p in capture.photos] == [
+        "p0.png",
+        "p1.png",
+        "p2.png",
+    ] and capture.kind == "duplicates"
     assert [len(np.unique(p.load().labels)) - 1 for p in capture.photos] == [3, 2, 3]
-    assert any("3 photos of one pile" in n for n in capture.notes) and any(n.startswith("p1.png: 2 objects") for n in capture.notes)
+    assert any("3 photos of one pile" in n for n in capture.notes) and any(
+        n.startswith("p1.png: 2 objects") for n in capture.notes
+    )
     assert len(open_capture(path).photos) == 1  # one of them alone
 
 
@@ -218,7 +268,10 @@ def test_cutouts_of_several_photos(tmp_path):
         photo(tmp_path, f"p{k}.png")
         (tmp_path / "cutouts" / f"p{k}").mkdir(parents=True)
         alpha = np.where(labels_of() == 60 + 40 * k, 255, 0).astype(np.uint8)
-        cv2.imwrite(str(tmp_path / "cutouts" / f"p{k}" / "0.png"), np.dstack([np.zeros((H, W, 3), np.uint8), alpha]))
+        cv2.imwrite(
+            str(tmp_path / "cutouts" / f"p{k}" / "0.png"),
+            np.dstack([np.zeros((H, W, 3), np.uint8), alpha]),
+        )
     first, second = (p.load().labels for p in open_capture(tmp_path).photos)
     assert first[48, 30] == 1 and first[48, 78] == 0 and second[48, 78] == 1
 
@@ -230,16 +283,24 @@ def bop(folder):
         mask = np.where(labels_of() == 60 + 40 * k, 255, 0).astype(np.uint8)
         cv2.imwrite(str(folder / "mask_visib" / f"000004_{k:06d}.png"), mask)
     pose = {"cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 700.0]}
-    (folder / "scene_gt.json").write_text(json.dumps({"4": [{"obj_id": o, **pose} for o in (5, 2, 5)]}))
-    (folder / "scene_camera.json").write_text(json.dumps({"4": {"cam_K": [210.0, 0, 79.5, 0, 210.0, 40.0, 0, 0, 1]}}))
+    (folder / "scene_gt.json").write_text(
+        json.dumps({"4": [{"obj_id": o, **pose} for o in (5, 2, 5)]})
+    )
+    (folder / "scene_camera.json").write_text(
+        json.dumps({"4": {"cam_K": [210.0, 0, 79.5, 0, 210.0, 40.0, 0, 0, 1]}})
+    )
     return folder
 
 
 def test_bop_scene(tmp_path):
     capture = open_capture(bop(tmp_path))
     camera, labels = capture.photos[0].camera, capture.photos[0].load().labels
-    assert (camera.fx, camera.cx, camera.cy) == (210.0, 80.0, 40.5) and capture.photos[0].name == "rgb/000004.png"
-    assert labels[48, 30] == 1 and labels[48, 78] == 0 and labels[48, 126] == 3  # the second is another object
+    assert (camera.fx, camera.cx, camera.cy) == (210.0, 80.0, 40.5) and capture.photos[
+        0
+    ].name == "rgb/000004.png"
+    assert (
+        labels[48, 30] == 1 and labels[48, 78] == 0 and labels[48, 126] == 3
+    )  # the second is another object
     assert any("obj_id 5" in n for n in capture.notes)
     (tmp_path / "mask_visib" / "000004_000002.png").unlink()
     with pytest.raises(UserError, match="no usable mask"):
@@ -252,7 +313,9 @@ def test_bop_scene(tmp_path):
 def test_principal_point_and_size_of_a_transforms_file(tmp_path):
     folder = sfd(tmp_path / "c")
     data = json.loads((folder / "transforms_train.json").read_text())
-    (folder / "transforms_train.json").write_text(json.dumps({**data, "w": 2 * W, "h": 2 * H, "cx": 150.0, "cy": 100.0}))
+    (folder / "transforms_train.json").write_text(
+        json.dumps({**data, "w": 2 * W, "h": 2 * H, "cx": 150.0, "cy": 100.0})
+    )
     camera = open_capture(folder).photos[0].camera
     assert (camera.fx, camera.cx, camera.cy) == (123.5 / 2, 75.0, 50.0)
 
@@ -276,15 +339,23 @@ def test_a_corrected_mask_corrects_the_labels(tmp_path):
     after, labels = corrected(folder, mask)
     fixed = after.photos[0].load()
     assert (fixed.labels[44:52, 24:36] == 0).all() and (fixed.labels[47:50, 97:99] == 100).all()
-    assert (fixed.labels[2:6, 150:158] == 0).all() and (fixed.labels != labels).sum() == 8 * 12 + (labels[47:50, 96:100] == 0).sum()
+    assert (fixed.labels[2:6, 150:158] == 0).all() and (fixed.labels != labels).sum() == 8 * 12 + (
+        labels[47:50, 96:100] == 0
+    ).sum()
     assert np.array_equal(fixed.mask > 0, fixed.labels > 0)
     said = " ".join(after.notes)
-    assert "corrected by hand; 96 pixels were taken out" in said and "32 pixels that were painted in" in said and "not known" in said
+    assert (
+        "corrected by hand; 96 pixels were taken out" in said
+        and "32 pixels that were painted in" in said
+        and "not known" in said
+    )
 
 
 def test_painting_on_a_smaller_copy_changes_no_border(tmp_path):
     folder = sfd(tmp_path / "c")
-    small = cv2.resize((labels_of() > 0).astype(np.float32), (W // 2, H // 2), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        (labels_of() > 0).astype(np.float32), (W // 2, H // 2), interpolation=cv2.INTER_AREA
+    )
     small[:, 50:] = 0  # the third object, and a part of the second, go
     after, labels = corrected(folder, small)
     fixed = after.photos[0].load().labels

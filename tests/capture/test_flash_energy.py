@@ -1,12 +1,13 @@
-"""WildLight's light_energy_i: photos without flash are left out of a flash capture, and others scaled where the flash's power differs."""
+"""WildLight's light_energy_i: photos without flash are left out of a flash capture, and others
+scaled where the flash's power differs."""
 
 import numpy as np
 import pytest
 import shots
 
-from relit.capture import open_capture
+from relit.capture.open import open_capture
 from relit.errors import UserError
-from relit.plan import Job, open_as
+from relit.job import Job, open_as
 
 
 @pytest.fixture
@@ -33,7 +34,9 @@ def test_photos_without_flash_are_left_out(folder):
     """Index 2 has energy 0, index 4 none: both are off."""
     path = folder({0: [5, 5, 5], 1: [5, 5, 5], 2: [0, 0, 0], 3: [5, 5, 5], 5: [5, 5, 5]})
     capture, kind = open_as(path, Job(capture="flash"))
-    assert kind == "flash" and [p.name for p in capture.photos] == [f"image/{i:03d}.png" for i in (0, 1, 3, 5)]
+    assert kind == "flash" and [p.name for p in capture.photos] == [
+        f"image/{i:03d}.png" for i in (0, 1, 3, 5)
+    ]
     assert any("2 of 6 photos were taken without the flash" in n for n in capture.notes)
     before = {p.name: p.load().rgb for p in open_capture(path).photos}
     for photo in capture.photos:
@@ -50,8 +53,13 @@ def test_photos_under_different_energies_are_evened_out(folder):
     capture, _ = open_as(path, Job(capture="flash"))
     before = {p.name: p.load().rgb for p in open_capture(path).photos}
     for i, photo in enumerate(capture.photos):
-        np.testing.assert_allclose(photo.load().rgb, before[photo.name] * (1 if i % 2 else 2), rtol=1e-6)
-        assert photo.load().white == pytest.approx(1 if i % 2 else 2) and photo.load().clipped is not None
+        np.testing.assert_allclose(
+            photo.load().rgb, before[photo.name] * (1 if i % 2 else 2), rtol=1e-6
+        )
+        assert (
+            photo.load().white == pytest.approx(1 if i % 2 else 2)
+            and photo.load().clipped is not None
+        )
     assert any("2 to 4" in n and "scaled" in n for n in capture.notes)
 
 
@@ -61,7 +69,11 @@ def test_files_without_energies_are_as_they_were(folder):
 
 
 @pytest.mark.parametrize(
-    "energies, message", [({0: [0.0] * 3}, "0 of 6 photos were taken with the flash on"), ({1: [-1.0] * 3}, "light_energy_1")]
+    "energies, message",
+    [
+        ({0: [0.0] * 3}, "0 of 6 photos were taken with the flash on"),
+        ({1: [-1.0] * 3}, "light_energy_1"),
+    ],
 )
 def test_senseless_energies(folder, energies, message):
     with pytest.raises(UserError, match=message):

@@ -1,4 +1,5 @@
-"""A round trip per format: known cameras are written, read and compared; coloured balls show that the axes are right."""
+"""A round trip per format: known cameras are written, read and compared; coloured balls show that
+the axes are right."""
 
 import json
 from dataclasses import replace
@@ -7,8 +8,8 @@ import numpy as np
 import pytest
 import shots
 
-from relit.capture import open_capture
-from relit.capture.colmap_model import camera_from_colmap
+from relit.capture.open import open_capture
+from relit.capture.readers.colmap_model import camera_from_colmap
 from relit.conventions import scale_of
 from relit.errors import UserError
 
@@ -40,7 +41,12 @@ def test_nerf_synthetic(tmp_path):
     angle = 2 * np.arctan(0.5 * cameras[0].width / cameras[0].fx)
     for split, some in (("train", cameras[:4]), ("val", cameras[4:5]), ("test", cameras[5:])):
         shots.write_photos(tmp_path / split, some, alpha=True, stem="r_{}")
-        shots.write_transforms(tmp_path, some, [f"./{split}/r_{i}" for i in range(len(some))], f"transforms_{split}.json")
+        shots.write_transforms(
+            tmp_path,
+            some,
+            [f"./{split}/r_{i}" for i in range(len(some))],
+            f"transforms_{split}.json",
+        )
         data = json.loads((tmp_path / f"transforms_{split}.json").read_text())
         kept = {"camera_angle_x": angle, "frames": data["frames"]}
         (tmp_path / f"transforms_{split}.json").write_text(json.dumps(kept))
@@ -51,7 +57,9 @@ def test_nerf_synthetic(tmp_path):
     assert capture.black_background
     mask = capture.photos[0].load().mask
     np.testing.assert_allclose(mask, shots.picture(cameras[0])[1], atol=0.01)
-    np.testing.assert_allclose(capture.photos[0].load().rgb, shots.picture(cameras[0])[0], atol=0.02)
+    np.testing.assert_allclose(
+        capture.photos[0].load().rgb, shots.picture(cameras[0])[0], atol=0.02
+    )
 
 
 def test_frames_without_a_file_are_held_out_or_left_out(tmp_path, cameras):
@@ -63,33 +71,53 @@ def test_frames_without_a_file_are_held_out_or_left_out(tmp_path, cameras):
     capture = open_capture(tmp_path)
     assert [p.name for p in capture.held_out] == ["heldout_from_history/001.png"]
     assert len(capture.photos) == 4
-    assert any("1 photos named in transforms.json are not there" in n and "images/002.png" in n for n in capture.notes)
+    assert any(
+        "1 photos named in transforms.json are not there" in n and "images/002.png" in n
+        for n in capture.notes
+    )
 
 
 def test_distortion_is_taken_out(tmp_path, cameras):
     """Pictures drawn through a lens come back such that plain projection finds the balls."""
     import cv2
 
-    from relit.cameras.pinhole import BrownLens, pixels_from_ideal
+    from relit.geometry.lens import BrownLens, pixels_from_ideal
 
     k = (-0.25, 0.1, 0.01, -0.005)
     names = shots.write_photos(tmp_path / "images", cameras)
     for camera, name in zip(cameras, names, strict=True):
         # a pinhole picture of a wider view, looked up through the lens
         wide = replace(
-            camera, width=camera.width * 4, height=camera.height * 4, cx=camera.cx + 1.5 * camera.width, cy=camera.cy + 1.5 * camera.height
+            camera,
+            width=camera.width * 4,
+            height=camera.height * 4,
+            cx=camera.cx + 1.5 * camera.width,
+            cy=camera.cy + 1.5 * camera.height,
         )
         rgb, _ = shots.picture(wide, samples=1)
-        from relit.cameras.pinhole import ideal_from_pixels
+        from relit.geometry.lens import ideal_from_pixels
 
         xs, ys = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         xy = ideal_from_pixels(camera, BrownLens(k), np.stack([xs.ravel(), ys.ravel()], 1))
-        p = pixels_from_ideal(wide, None, xy).reshape(camera.height, camera.width, 2).astype(np.float32) - 0.5
-        shots.images.write_srgb(tmp_path / "images" / name, cv2.remap(rgb, p[..., 0], p[..., 1], cv2.INTER_LINEAR))
-    shots.write_transforms(tmp_path, cameras, [f"images/{n}" for n in names], k1=k[0], k2=k[1], p1=k[2], p2=k[3])
+        p = (
+            pixels_from_ideal(wide, None, xy)
+            .reshape(camera.height, camera.width, 2)
+            .astype(np.float32)
+            - 0.5
+        )
+        shots.images.write_srgb(
+            tmp_path / "images" / name, cv2.remap(rgb, p[..., 0], p[..., 1], cv2.INTER_LINEAR)
+        )
+    shots.write_transforms(
+        tmp_path, cameras, [f"images/{n}" for n in names], k1=k[0], k2=k[1], p1=k[2], p2=k[3]
+    )
     capture = open_capture(tmp_path, masks="none")
     photo = capture.photos[0]
-    assert photo.camera.distortion == () and photo.load().rgb.shape == (photo.height, photo.width, 3)
+    assert photo.camera.distortion == () and photo.load().rgb.shape == (
+        photo.height,
+        photo.width,
+        3,
+    )
     assert sum(shots.check_projection(p) for p in capture.photos) > len(cameras)
 
 
@@ -117,7 +145,10 @@ def test_idr(tmp_path, cameras, name):
 
 def test_idr_projections_of_any_scale_and_sign(tmp_path, cameras):
     shots.write_photos(tmp_path / "image", cameras)
-    np.savez(tmp_path / "cameras.npz", **{f"world_mat_{i}": -0.37 * shots.projection(c) for i, c in enumerate(cameras)})
+    np.savez(
+        tmp_path / "cameras.npz",
+        **{f"world_mat_{i}": -0.37 * shots.projection(c) for i, c in enumerate(cameras)},
+    )
     check(open_capture(tmp_path), cameras, "idr")
 
 
@@ -127,7 +158,9 @@ def test_middlebury(tmp_path, cameras):
     for camera, name in zip(cameras, names, strict=True):
         k = replace(camera, cx=camera.cx - 0.5, cy=camera.cy - 0.5).intrinsics
         m = camera.camera_from_world
-        lines.append(" ".join([name, *(repr(float(v)) for v in [*k.ravel(), *m[:3, :3].ravel(), *m[:3, 3]])]))
+        lines.append(
+            " ".join([name, *(repr(float(v)) for v in [*k.ravel(), *m[:3, :3].ravel(), *m[:3, 3]])])
+        )
     (tmp_path / "balls_par.txt").write_text("\n".join(lines))
     check(open_capture(tmp_path), cameras, "middlebury")
 
@@ -138,7 +171,13 @@ def test_llff(tmp_path):
     rows = []
     for c in cameras:
         right, down, forward, t = c.world_from_camera[:3].T
-        rows.append([*np.column_stack([down, right, -forward, t, [c.height, c.width, c.fx]]).ravel(), 2.0, 6.0])
+        rows.append(
+            [
+                *np.column_stack([down, right, -forward, t, [c.height, c.width, c.fx]]).ravel(),
+                2.0,
+                6.0,
+            ]
+        )
     np.save(tmp_path / "poses_bounds.npy", np.array(rows))
     check(open_capture(tmp_path), cameras, "llff")
 
@@ -165,19 +204,28 @@ def test_colmap_points_and_model_folder(tmp_path):
     import pycolmap
 
     pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions(num_points3D=80, num_frames_per_rig=3, camera_width=72, camera_height=56)
-    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [90.0, 36.0, 28.0, 0.05]
+    options = pycolmap.SyntheticDatasetOptions(
+        num_points3D=80, num_frames_per_rig=3, camera_width=72, camera_height=56
+    )
+    options.camera_model_id, options.camera_params = (
+        pycolmap.CameraModelId.SIMPLE_RADIAL,
+        [90.0, 36.0, 28.0, 0.05],
+    )
     model = pycolmap.synthesize_dataset(options)
     (tmp_path / "sparse").mkdir()
     (tmp_path / "images").mkdir()
     model.write_binary(str(tmp_path / "sparse"))
     for image in model.images.values():
-        shots.images.write_srgb(tmp_path / "images" / image.name, np.random.default_rng(0).uniform(size=(56, 72, 3)))
+        shots.images.write_srgb(
+            tmp_path / "images" / image.name, np.random.default_rng(0).uniform(size=(56, 72, 3))
+        )
     capture = open_capture(tmp_path, masks="none", min_photos=2)
     assert len(capture.photos) == 6 and capture.points.shape == (80, 3)
     for photo in capture.photos:
         image = model.find_image_with_name(photo.name.removeprefix("images/"))
-        np.testing.assert_allclose(photo.camera.camera_from_world[:3], image.cam_from_world().matrix(), atol=1e-9)
+        np.testing.assert_allclose(
+            photo.camera.camera_from_world[:3], image.cam_from_world().matrix(), atol=1e-9
+        )
         assert photo.camera.fx == 90.0 and photo.camera.distortion == ()
     assert open_capture(tmp_path / "sparse", masks="none").format == "colmap"
 
@@ -201,14 +249,20 @@ def test_colmap_points_and_model_folder(tmp_path):
 def test_every_colmap_lens(model, params):
     import pycolmap
 
-    from relit.cameras.pinhole import lens_of, pixels_from_ideal
+    from relit.geometry.lens import lens_of, pixels_from_ideal
 
-    head = [80.0, 35.0, 29.0] if model.startswith("SIMPLE") or model.startswith("RADIAL") else [80.0, 82.0, 35.0, 29.0]
+    head = (
+        [80.0, 35.0, 29.0]
+        if model.startswith("SIMPLE") or model.startswith("RADIAL")
+        else [80.0, 82.0, 35.0, 29.0]
+    )
     reference = pycolmap.Camera(model=model, width=70, height=60, params=head + params)
     camera, lens = camera_from_colmap(reference, np.eye(4))
     xy = np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2))
     expected = reference.img_from_cam(np.concatenate([xy, np.ones((20, 1))], axis=1))
-    np.testing.assert_allclose(pixels_from_ideal(camera, lens or lens_of(camera), xy), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        pixels_from_ideal(camera, lens or lens_of(camera), xy), expected, atol=1e-9
+    )
 
 
 def test_plain_photos(tmp_path):
@@ -222,10 +276,20 @@ def test_plain_photos(tmp_path):
 def test_a_fisheye_of_nerfstudio_is_undistorted(tmp_path, cameras):
     names = shots.write_photos(tmp_path / "images", cameras)
     shots.write_transforms(
-        tmp_path, cameras, [f"images/{n}" for n in names], camera_model="OPENCV_FISHEYE", k1=0.05, k2=0.0, k3=0.0, k4=0.0
+        tmp_path,
+        cameras,
+        [f"images/{n}" for n in names],
+        camera_model="OPENCV_FISHEYE",
+        k1=0.05,
+        k2=0.0,
+        k3=0.0,
+        k4=0.0,
     )
     photo = open_capture(tmp_path, masks="none").photos[0]
-    assert photo.load().rgb.shape == (photo.height, photo.width, 3) and photo.camera.fx == cameras[0].fx
+    assert (
+        photo.load().rgb.shape == (photo.height, photo.width, 3)
+        and photo.camera.fx == cameras[0].fx
+    )
     assert (photo.width, photo.height) != (72, 56)
 
 
@@ -239,7 +303,9 @@ def test_cameras_of_photos_as_stored_before_exif_turned_them(tmp_path, cameras):
     for i, camera in enumerate(cameras):
         data = shots.images.encode_png(shots.picture(camera)[0])
         (tmp_path / "x.png").write_bytes(data)
-        PilImage.open(tmp_path / "x.png").save(tmp_path / "images" / f"{i}.jpg", exif=exif, quality=97, subsampling=0)
+        PilImage.open(tmp_path / "x.png").save(
+            tmp_path / "images" / f"{i}.jpg", exif=exif, quality=97, subsampling=0
+        )
     (tmp_path / "x.png").unlink()
     shots.write_transforms(tmp_path, cameras, [f"images/{i}.jpg" for i in range(6)])
     check(open_capture(tmp_path), cameras, "transforms")
@@ -275,14 +341,18 @@ def test_a_scale_in_the_pose_is_taken_out(tmp_path, cameras):
 
 def test_numbers_of_cameras_and_photos_must_agree(tmp_path, cameras):
     shots.write_photos(tmp_path / "image", cameras[:-1])
-    np.savez(tmp_path / "cameras.npz", **{f"world_mat_{i}": shots.projection(c) for i, c in enumerate(cameras)})
+    np.savez(
+        tmp_path / "cameras.npz",
+        **{f"world_mat_{i}": shots.projection(c) for i, c in enumerate(cameras)},
+    )
     with pytest.raises(UserError, match="6 cameras and 5 photos do not match"):
         open_capture(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".exr"])
 def test_normal_priors_know_where_they_know_nothing(tmp_path, suffix):
-    """Black and middle grey of a picture and zeros of an EXR are no normals; the others come back unit, resized or not."""
+    """Black and middle grey of a picture and zeros of an EXR are no normals; the others come back
+    unit, resized or not."""
     from relit.capture.photo import read_normal
     from relit.images import write_data, write_linear
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from relit.capture import open_capture
-from relit.capture.samurai import read_hints
+from relit.capture.open import open_capture
+from relit.capture.readers.samurai import read_hints
 from relit.errors import UserError
 from relit.images import write_srgb
 from relit.masks.rle import runs_from
@@ -17,11 +17,15 @@ def runs_of(mask):
     flat = mask.T.ravel() > 0.5
     ends = np.flatnonzero(np.diff(flat)) + 1
     counts = np.diff([0, *ends, len(flat)]).tolist()
-    return {"counts": " ".join(map(str, counts if not flat[0] else [0, *counts])), "size": list(mask.shape)}
+    return {
+        "counts": " ".join(map(str, counts if not flat[0] else [0, *counts])),
+        "size": list(mask.shape),
+    }
 
 
 def look_from(azimuth):
-    """PyTorch3D's camera (row vectors, x left, y up) at distance 2.5 in the horizontal plane; 0 is on +z."""
+    """PyTorch3D's camera (row vectors, x left, y up) at distance 2.5 in the horizontal plane; 0 is
+    on +z."""
     a = np.radians(azimuth)
     eye = 2.5 * np.array([np.sin(a), 0, np.cos(a)])
     z = -eye / np.linalg.norm(eye)
@@ -34,16 +38,22 @@ def look_from(azimuth):
 def cars(tmp_path):
     rng, entries = np.random.default_rng(0), []
     for i, azimuth in enumerate((0, 90, 180, 270)):
-        write_srgb(tmp_path / "images" / f"{i}.png", rng.uniform(0, 1, (30, 40, 3)).astype(np.float32))
+        write_srgb(
+            tmp_path / "images" / f"{i}.png", rng.uniform(0, 1, (30, 40, 3)).astype(np.float32)
+        )
         mask = np.zeros((30, 40), np.float32)
         mask[8:20, 5 + i : 30] = 1
-        entries.append({"filename": f"{i}.png", "mask": runs_of(mask), "camera_initial": look_from(azimuth)})
+        entries.append(
+            {"filename": f"{i}.png", "mask": runs_of(mask), "camera_initial": look_from(azimuth)}
+        )
     write(tmp_path, entries[::-1])  # the order in the file is nobody's
     return tmp_path, entries
 
 
 def write(folder, entries):
-    (folder / "annotations.json").write_text(json.dumps({"id": "7", "car_model": "a car", "annotations": entries}))
+    (folder / "annotations.json").write_text(
+        json.dumps({"id": "7", "car_model": "a car", "annotations": entries})
+    )
 
 
 def test_masks_and_directions(cars):
@@ -51,7 +61,9 @@ def test_masks_and_directions(cars):
     assert (capture.format, capture.kind, len(capture.photos)) == ("mvmc", "collection", 4)
     for i, photo in enumerate(capture.photos):
         mask = photo.load().mask
-        assert mask.shape == (30, 40) and mask[8:20, 5 + i : 30].all() and mask.sum() == 12 * (25 - i)
+        assert (
+            mask.shape == (30, 40) and mask[8:20, 5 + i : 30].all() and mask.sum() == 12 * (25 - i)
+        )
     hints = read_hints(capture.root, [p.name for p in capture.photos])
     seen = [hints.directions[p.name] for p in capture.photos]
     assert np.allclose(seen, [[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]], atol=1e-6)
@@ -109,7 +121,13 @@ def test_damaged_files(cars, change, words):
 
 def test_cameras_that_are_none(cars):
     folder, entries = cars
-    write(folder, [{**entries[0], "camera_initial": {"R": np.zeros((3, 3)).tolist(), "T": [0, 0, 1]}}, *entries[1:]])
+    write(
+        folder,
+        [
+            {**entries[0], "camera_initial": {"R": np.zeros((3, 3)).tolist(), "T": [0, 0, 1]}},
+            *entries[1:],
+        ],
+    )
     with pytest.raises(UserError, match="no camera"):
         read_hints(folder, ["images/0.png"])
 

@@ -12,7 +12,7 @@ from relit.capture.networks import MEAN, SPREAD, Network, found_instances, predi
 from relit.conventions import similarity
 from relit.errors import UserError
 from relit.evaluate.duplicates import photo_figure
-from relit.plan import Job, open_as
+from relit.job import Job, open_as
 from relit.scene import Asset, Camera, Instance, Material, Mesh
 
 W, H = 160, 96
@@ -35,13 +35,17 @@ def segmenter(file):
 
 def test_a_photo_without_labels_and_a_segmenter(tmp_path):
     path, network = two_discs(tmp_path), segmenter(tmp_path / "segmenter.onnx")
-    capture, kind = open_as(path, Job(capture="duplicates", masks=f"segment:{network}", focal=200.0))
+    capture, kind = open_as(
+        path, Job(capture="duplicates", masks=f"segment:{network}", focal=200.0)
+    )
     labels = capture.photos[0].load().labels
     assert kind == "duplicates" and set(np.unique(labels)) == {0, 1, 2}
     assert labels[48, 40] == 1 and labels[50, 115] == 2 and labels[5, 80] == 0
     assert abs((labels == 2).sum() - np.pi * 30**2) < 250
     assert any("2 objects found by segmenter.onnx" in n for n in capture.notes)
-    folder, _ = open_as(tmp_path, Job(capture="duplicates", masks=f"segment:{network}", focal=200.0))
+    folder, _ = open_as(
+        tmp_path, Job(capture="duplicates", masks=f"segment:{network}", focal=200.0)
+    )
     assert len(folder.photos) == 1
 
 
@@ -52,15 +56,27 @@ def test_a_run_with_a_segmenter_is_measured_by_its_labels(tmp_path, device):
     ball = trimesh.creation.icosphere(3)
     v, one = ball.vertices.astype(np.float32), np.ones((1, 1), np.float32)
     material = Material(np.full((1, 1, 3), 0.5, np.float32), one, 0 * one)
-    poses = [similarity(np.eye(3), [(x - 80) / 20, (y - 48) / 20, 10.0], r / 20) for x, y, r in ((40, 48, 25), (115, 50, 30))]
+    poses = [
+        similarity(np.eye(3), [(x - 80) / 20, (y - 48) / 20, 10.0], r / 20)
+        for x, y, r in ((40, 48, 25), (115, 50, 30))
+    ]
     instances = tuple(Instance(k + 1, pose) for k, pose in enumerate(poses))
     camera = Camera(W, H, 200.0, 200.0, W / 2, H / 2, np.eye(4))
     light = np.ones((8, 16, 3), np.float32)
-    asset = Asset(Mesh(v, ball.faces.astype(np.int32), v), material, poses[0], light, (("photo.png", camera),), instances=instances)
+    asset = Asset(
+        Mesh(v, ball.faces.astype(np.int32), v),
+        material,
+        poses[0],
+        light,
+        (("photo.png", camera),),
+        instances=instances,
+    )
     with pytest.raises(UserError, match="no photo of duplicates"):
         photo_figure(asset, path, run=tmp_path / "run", spp=4)
     (tmp_path / "run" / "config.toml").write_text(f'masks = "segment:{network}"\n')
-    assert 3 < photo_figure(asset, path, run=tmp_path / "run", spp=4) < 20  # a grey ball where a red and a blue disc are
+    assert (
+        3 < photo_figure(asset, path, run=tmp_path / "run", spp=4) < 20
+    )  # a grey ball where a red and a blue disc are
 
 
 def test_without_a_segmenter_it_is_named_in_the_way_out(tmp_path):
@@ -85,7 +101,10 @@ def test_predicted_normals_are_turned_to_the_cameras_axes(tmp_path, coded):
     labels = np.zeros((H, W), np.int32)
     cv2.circle(labels, (40, 48), 25, 7, -1)
     normal = predicted_normals(network, np.full((H, W, 3), 0.3, np.float32), labels)
-    assert np.allclose(normal[labels == 7], [0, -0.6, -0.8], atol=0.01) and (normal[labels == 0] == 0).all()
+    assert (
+        np.allclose(normal[labels == 7], [0, -0.6, -0.8], atol=0.01)
+        and (normal[labels == 0] == 0).all()
+    )
 
 
 def test_wrong_networks_are_named(tmp_path):

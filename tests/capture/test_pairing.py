@@ -1,4 +1,5 @@
-"""Which camera, mask and normal prior belong to which photo, where names repeat, files are missing or other programs' files lie about."""
+"""Which camera, mask and normal prior belong to which photo, where names repeat, files are missing
+or other programs' files lie about."""
 
 import json
 
@@ -8,9 +9,9 @@ import shots
 from PIL import Image as PilImage
 
 from relit import images
-from relit.capture import open_capture
+from relit.capture.open import open_capture
 from relit.errors import UserError
-from relit.plan import Job, open_as
+from relit.job import Job, open_as
 
 
 def write_splits(root, cameras):
@@ -18,7 +19,9 @@ def write_splits(root, cameras):
     splits = {"train": cameras, "test": shots.ring(distance=5.0)}
     for split, some in splits.items():
         names = shots.write_photos(root / split, some, background=shots.BACKGROUND)
-        shots.write_transforms(root, some, [f"{split}/{n}" for n in names], f"transforms_{split}.json")
+        shots.write_transforms(
+            root, some, [f"{split}/{n}" for n in names], f"transforms_{split}.json"
+        )
     return splits
 
 
@@ -36,7 +39,11 @@ def test_a_missing_training_photo_is_not_taken_from_the_test_split(tmp_path, cam
 
 
 def test_a_missing_photo_of_a_rig_is_not_taken_from_the_other_camera(tmp_path, cameras):
-    names = [f"{side}/{n}" for side, some in (("left", cameras[:3]), ("right", cameras[3:])) for n in _written(tmp_path, side, some)]
+    names = [
+        f"{side}/{n}"
+        for side, some in (("left", cameras[:3]), ("right", cameras[3:]))
+        for n in _written(tmp_path, side, some)
+    ]
     shots.write_colmap_text(tmp_path / "sparse" / "0", cameras, names)
     (tmp_path / "images" / "left" / "001.png").unlink()
     capture = open_capture(tmp_path)
@@ -59,15 +66,21 @@ def test_images_beside_the_model_come_first(tmp_path, cameras):
 
 
 def test_synthetic4relight(tmp_path, cameras):
-    """Its file_path is train/000: the photo is train/000_rgb.exr with train/000_mask.png, a test photo is test/000_rgba.png."""
+    """Its file_path is train/000: the photo is train/000_rgb.exr with train/000_mask.png, a test
+    photo is test/000_rgba.png."""
     for split, suffix, stem in (("train", ".exr", "{:03d}_rgb"), ("test", ".png", "{:03d}_rgba")):
         shots.write_photos(tmp_path / split, cameras, suffix, alpha=split == "test", stem=stem)
-        shots.write_transforms(tmp_path, cameras, [f"{split}/{i:03d}" for i in range(6)], f"transforms_{split}.json")
+        shots.write_transforms(
+            tmp_path, cameras, [f"{split}/{i:03d}" for i in range(6)], f"transforms_{split}.json"
+        )
     alphas = [shots.picture(c)[1] for c in cameras]
     for i, alpha in enumerate(alphas):
         images.write_data(tmp_path / "train" / f"{i:03d}_mask.png", alpha)
     capture = open_capture(tmp_path)
-    assert [p.name for p in (capture.photos[1], capture.held_out[1])] == ["train/001_rgb.exr", "test/001_rgba.png"]
+    assert [p.name for p in (capture.photos[1], capture.held_out[1])] == [
+        "train/001_rgb.exr",
+        "test/001_rgba.png",
+    ]
     assert sum(shots.check_projection(p) for p in capture.photos) > len(cameras)
     np.testing.assert_allclose(capture.photos[1].load().mask, alphas[1], atol=0.01)
 
@@ -78,9 +91,17 @@ def test_a_camera_file_of_iron_may_be_opened_itself(tmp_path, cameras):
     for name, c in zip(names, cameras, strict=True):
         k = np.eye(4)
         k[:3, :3] = c.intrinsics
-        entries[name] = {"K": k.ravel().tolist(), "W2C": c.camera_from_world.ravel().tolist(), "img_size": [c.width, c.height]}
+        entries[name] = {
+            "K": k.ravel().tolist(),
+            "W2C": c.camera_from_world.ravel().tolist(),
+            "img_size": [c.width, c.height],
+        }
     (tmp_path / "cam_dict_norm.json").write_text(json.dumps(entries))
-    assert open_capture(tmp_path / "cam_dict_norm.json").format == open_capture(tmp_path).format == "iron"
+    assert (
+        open_capture(tmp_path / "cam_dict_norm.json").format
+        == open_capture(tmp_path).format
+        == "iron"
+    )
 
 
 @pytest.mark.parametrize("name", ["metadata.json", "annotations.json"])
@@ -95,7 +116,9 @@ def test_segmentations_make_no_pile_of_what_is_asked_for_as_another_kind(tmp_pat
     names = shots.write_photos(tmp_path, cameras, background=shots.BACKGROUND)
     shots.write_transforms(tmp_path, cameras, names)
     for i, camera in enumerate(cameras):
-        images.write_data(tmp_path / f"{i:03d}_seg.png", (shots.picture(camera)[1] > 0.5).astype(np.float32))
+        images.write_data(
+            tmp_path / f"{i:03d}_seg.png", (shots.picture(camera)[1] > 0.5).astype(np.float32)
+        )
     capture, kind = open_as(tmp_path, Job(capture="multiview"))
     assert (capture.format, kind, len(capture.photos)) == ("transforms", "multiview", 6)
     assert open_as(tmp_path, Job())[1] == "duplicates"
@@ -117,7 +140,8 @@ def test_masks_of_two_splits_of_the_same_names(tmp_path, cameras):
 
 @pytest.mark.parametrize("orientation", [6, 8])
 def test_upright_masks_of_photos_that_are_left_as_stored(tmp_path, cameras, orientation):
-    """The cameras are those of the pixels as stored; the masks were made from the pictures as EXIF turns them."""
+    """The cameras are those of the pixels as stored; the masks were made from the pictures as EXIF
+    turns them."""
     exif = PilImage.Exif()
     exif[0x0112] = orientation
     (tmp_path / "images").mkdir()
@@ -148,13 +172,18 @@ def test_masks_beside_the_photos_may_end_otherwise(capture_folder, cameras, suff
     for i, camera in enumerate(cameras):
         codes = (shots.picture(camera)[1] * 255).astype(np.uint8)
         PilImage.fromarray(codes).save(capture_folder / "images" / f"{i:03d}_mask{suffix}")
-    np.testing.assert_allclose(open_capture(capture_folder).photos[2].load().mask, shots.picture(cameras[2])[1], atol=0.01)
+    np.testing.assert_allclose(
+        open_capture(capture_folder).photos[2].load().mask, shots.picture(cameras[2])[1], atol=0.01
+    )
 
 
 def test_a_backdrop_is_looked_for_in_training_photos(tmp_path):
     """Every second of 24 photos is held out, just those that an even sample would take."""
     cameras = shots.ring(24)
-    names = [f"images/{n}" for n in shots.write_photos(tmp_path / "images", cameras, background=shots.BACKGROUND)]
+    names = [
+        f"images/{n}"
+        for n in shots.write_photos(tmp_path / "images", cameras, background=shots.BACKGROUND)
+    ]
     shots.write_transforms(tmp_path, cameras, names, test_filenames=names[::2])
     capture = open_capture(tmp_path)
     assert len(capture.photos) == 12 and any("plain backdrop" in n for n in capture.notes)

@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from relit.capture import open_capture
-from relit.capture.samurai import direction_of, read_hints
+from relit.capture.open import open_capture
+from relit.capture.readers.samurai import direction_of, read_hints
 from relit.errors import UserError
 from relit.images import write_data, write_srgb
 
@@ -16,7 +16,9 @@ def folder(tmp_path):
     mask = np.zeros((24, 32), np.float32)
     mask[6:18, 8:24] = 1
     for i in range(6):
-        write_srgb(tmp_path / "image" / f"{i}.png", rng.uniform(0, 1, (24, 32, 3)).astype(np.float32))
+        write_srgb(
+            tmp_path / "image" / f"{i}.png", rng.uniform(0, 1, (24, 32, 3)).astype(np.float32)
+        )
         write_data(tmp_path / "mask" / f"{i}.png", mask)
     return tmp_path
 
@@ -41,7 +43,12 @@ def test_layout_is_recognised(folder):
     write_quadrants(folder, ANSWERS)
     (folder / "held_out.json").write_text(json.dumps({"frames": ["5.png"]}))
     capture = open_capture(folder, min_photos=4)
-    assert (capture.kind, capture.format, len(capture.photos), len(capture.held_out)) == ("collection", "samurai", 5, 1)
+    assert (capture.kind, capture.format, len(capture.photos), len(capture.held_out)) == (
+        "collection",
+        "samurai",
+        5,
+        1,
+    )
     assert capture.photos[0].load().mask.max() == 1
     assert not capture.has_cameras
 
@@ -76,7 +83,13 @@ def test_words_that_are_no_answers_are_refused(folder, answers):
 
 
 def test_malformed_files_are_refused(folder):
-    for text in ('{"frames": 3}', '{"frames": [3]}', '{"frames": [{"quadrant": ["Left"]}]}', "[]", "{"):
+    for text in (
+        '{"frames": 3}',
+        '{"frames": [3]}',
+        '{"frames": [{"quadrant": ["Left"]}]}',
+        "[]",
+        "{",
+    ):
         (folder / "quadrants.json").write_text(text)
         with pytest.raises(UserError):
             read_hints(folder, [f"image/{i}.png" for i in range(6)])
@@ -84,12 +97,16 @@ def test_malformed_files_are_refused(folder):
 
 def test_angles_of_ners(tmp_path):
     names = [f"images/{c}.jpg" for c in "bca"]
-    (tmp_path / "metadata.json").write_text(json.dumps({"azimuths": [0, 90, 180], "elevations": [0, 30, 90]}))
+    (tmp_path / "metadata.json").write_text(
+        json.dumps({"azimuths": [0, 90, 180], "elevations": [0, 30, 90]})
+    )
     hints = read_hints(tmp_path, names)
     assert np.allclose(hints.directions["images/a.jpg"], [0, 0, 1])
     assert np.allclose(hints.directions["images/b.jpg"], [np.cos(np.pi / 6), 0.5, 0])
     assert np.allclose(hints.directions["images/c.jpg"], [0, 1, 0], atol=1e-9)
-    (tmp_path / "metadata.json").write_text(json.dumps({"azimuths": [0, 90], "elevations": [0, 30]}))
+    (tmp_path / "metadata.json").write_text(
+        json.dumps({"azimuths": [0, 90], "elevations": [0, 30]})
+    )
     with pytest.raises(UserError, match="2 azimuths"):
         read_hints(tmp_path, names)
 

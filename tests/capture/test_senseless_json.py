@@ -1,4 +1,5 @@
-"""Senseless values at random places of the JSON files that captures bring along: read, or refused with an answer; never a stack trace."""
+"""Senseless values at random places of the JSON files that captures bring along: read, or refused
+with an answer; never a stack trace."""
 
 import copy
 import json
@@ -8,14 +9,29 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from relit.cameras.se3 import look_at
-from relit.capture import open_capture
-from relit.capture.samurai import read_hints
+from relit.capture.open import open_capture
+from relit.capture.readers.samurai import read_hints
 from relit.conventions import world_from_gl_camera
 from relit.errors import UserError
+from relit.geometry.se3 import look_at
 
 SIDE = 64
-JUNK = [None, True, -1, 0, 1e308, -1e-308, float("nan"), float("inf"), 10**30, 10**400, "", "x", "../../etc/passwd", "\x00"]
+JUNK = [
+    None,
+    True,
+    -1,
+    0,
+    1e308,
+    -1e-308,
+    float("nan"),
+    float("inf"),
+    10**30,
+    10**400,
+    "",
+    "x",
+    "../../etc/passwd",
+    "\x00",
+]
 JUNK += [[], {}, [[]], [1, 2], {"a": 1}, [None] * 3]
 
 
@@ -30,8 +46,16 @@ def mvmc(root):
     photos(root / "images")
     turn = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
     mask = {"size": [SIDE, SIDE], "counts": [1000, 2000, SIDE * SIDE - 3000]}
-    entry = {"mask": mask, "camera_initial": {"R": turn, "T": [0, 0, 2], "fov": 60.0}, "bbox": [1, 2, 9, 9]}
-    return "annotations.json", {"id": "7", "car_model": "a", "annotations": [{"filename": f"{i}.png", **entry} for i in range(4)]}
+    entry = {
+        "mask": mask,
+        "camera_initial": {"R": turn, "T": [0, 0, 2], "fov": 60.0},
+        "bbox": [1, 2, 9, 9],
+    }
+    return "annotations.json", {
+        "id": "7",
+        "car_model": "a",
+        "annotations": [{"filename": f"{i}.png", **entry} for i in range(4)],
+    }
 
 
 def ners(root):
@@ -41,13 +65,23 @@ def ners(root):
 
 def samurai(root):
     photos(root / "image")
-    answers = (["Left", "Center", "Front"], ["Right", "Above", "Front"], ["Center", "Center", "Back"], ["Left", "Below", "Back"])
-    return "quadrants.json", {"frames": [{"image_name": f"{i}.png", "quadrant": a} for i, a in enumerate(answers)]}
+    answers = (
+        ["Left", "Center", "Front"],
+        ["Right", "Above", "Front"],
+        ["Center", "Center", "Back"],
+        ["Left", "Below", "Back"],
+    )
+    return "quadrants.json", {
+        "frames": [{"image_name": f"{i}.png", "quadrant": a} for i, a in enumerate(answers)]
+    }
 
 
 def coco(root):
     photos(root, 1)
-    shapes = [[[2, 2, 30, 2, 30, 30, 2, 30]], {"size": [SIDE, SIDE], "counts": [2300, 1500, SIDE * SIDE - 3800]}]
+    shapes = [
+        [[2, 2, 30, 2, 30, 30, 2, 30]],
+        {"size": [SIDE, SIDE], "counts": [2300, 1500, SIDE * SIDE - 3800]},
+    ]
     return "annotations.json", {
         "images": [{"id": 7, "file_name": "0.png", "width": SIDE, "height": SIDE}],
         "annotations": [{"image_id": 7, "segmentation": s} for s in shapes],
@@ -56,7 +90,10 @@ def coco(root):
 
 def nerfstudio(root):
     photos(root / "images")
-    poses = [world_from_gl_camera(look_at([3 * np.sin(i), 0.5, 3 * np.cos(i)], np.zeros(3))).tolist() for i in range(4)]
+    poses = [
+        world_from_gl_camera(look_at([3 * np.sin(i), 0.5, 3 * np.cos(i)], np.zeros(3))).tolist()
+        for i in range(4)
+    ]
     frames = [{"file_path": f"images/{i}.png", "transform_matrix": p} for i, p in enumerate(poses)]
     lens = {"fl_x": 80.0, "fl_y": 80.0, "cx": 32.0, "cy": 32.0, "k1": 0.01, "p1": 0.0}
     return "transforms.json", {"camera_model": "OPENCV", **lens, "frames": frames}
@@ -65,7 +102,13 @@ def nerfstudio(root):
 def places(node, path=()):
     """Every place of a JSON value, as a tuple of keys."""
     yield path
-    for key, value in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+    for key, value in (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node)
+        if isinstance(node, list)
+        else ()
+    ):
         yield from places(value, (*path, key))
 
 

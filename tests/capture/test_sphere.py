@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import shots
 
-from relit.cameras.se3 import exp_so3, look_at
 from relit.capture import sphere as s
 from relit.conventions import move_pose, similarity
 from relit.errors import UserError
+from relit.geometry.se3 import exp_so3, look_at
 from relit.scene import Camera, Sphere
 
 
@@ -31,9 +31,14 @@ def views(cameras):
 @pytest.mark.parametrize("seed", range(3))
 def test_from_masks_in_any_frame(seed):
     rng = np.random.default_rng(seed)
-    b_from_a = similarity(exp_so3(rng.normal(size=3)), rng.normal(size=3) * 10, 0.03 if seed else 70.0)
+    b_from_a = similarity(
+        exp_so3(rng.normal(size=3)), rng.normal(size=3) * 10, 0.03 if seed else 70.0
+    )
     cameras = shots.ring(8)
-    moved = [s.View(v.camera.with_pose(move_pose(b_from_a, v.camera.world_from_camera)), mask=v.mask) for v in views(cameras)]
+    moved = [
+        s.View(v.camera.with_pose(move_pose(b_from_a, v.camera.world_from_camera)), mask=v.mask)
+        for v in views(cameras)
+    ]
     sphere, source = s.find_sphere(moved)
     points = object_points() @ b_from_a[:3, :3].T + b_from_a[:3, 3]
     assert source == "the masks"
@@ -41,7 +46,7 @@ def test_from_masks_in_any_frame(seed):
 
 
 def test_from_masks_of_a_lens_and_of_pictures_that_cut_the_object():
-    from relit.cameras.pinhole import BrownLens
+    from relit.geometry.lens import BrownLens
 
     close = [replace(c, fx=c.fx * 1.6, fy=c.fy * 1.6) for c in shots.ring(12)]
     holds(s.sphere_from_masks(views(close)), object_points(), 0.55, 1.02)
@@ -67,7 +72,10 @@ def test_the_masks_that_miss_the_object_are_named():
     good = views(shots.ring(10))
     wrong = np.zeros_like(good[3].mask)
     wrong[:6, :6] = 1
-    named = [s.View(v.camera, mask=wrong if i in (3, 7) else v.mask, name=f"p{i}.png") for i, v in enumerate(good)]
+    named = [
+        s.View(v.camera, mask=wrong if i in (3, 7) else v.mask, name=f"p{i}.png")
+        for i, v in enumerate(good)
+    ]
     with pytest.raises(UserError, match="no place in common") as caught:
         s.sphere_from_masks(named)
     assert caught.value.why.endswith(": p3.png, p7.png") and "--edit" in caught.value.fix
@@ -102,7 +110,9 @@ def test_the_longer_side_of_the_pictures_counts():
     upright = [replace(c, height=2 * c.height, cy=2 * c.cy) for c in square]
     small, large = s.sphere_from_rays(square).radius, s.sphere_from_rays(upright).radius
     distance = np.linalg.norm(square[0].centre)
-    assert large == pytest.approx(min(distance * np.sin(np.arctan(upright[0].height / 200)), 0.8 * distance), rel=0.05)
+    assert large == pytest.approx(
+        min(distance * np.sin(np.arctan(upright[0].height / 200)), 0.8 * distance), rel=0.05
+    )
     assert large > 1.3 * small
 
 
@@ -120,7 +130,9 @@ def test_a_pose_with_senseless_numbers_is_no_crash(value):
         rays = [origins.copy(), -origins]
         rays[which][0, 0] = value
         assert s.robust_closest_point(*rays).shape == (3,)
-    assert s.robust_closest_point(np.zeros((4, 3)), np.zeros((4, 3))).shape == (3,)  # and so is one without a direction
+    assert s.robust_closest_point(np.zeros((4, 3)), np.zeros((4, 3))).shape == (
+        3,
+    )  # and so is one without a direction
 
 
 def test_cameras_that_look_outwards():
@@ -159,5 +171,7 @@ def test_up_from_level_cameras(up):
 
 def test_no_up_from_rolled_cameras():
     rng = np.random.default_rng(0)
-    cameras = [c.with_pose(look_at(c.centre, np.zeros(3), rng.normal(size=3))) for c in shots.ring(20)]
+    cameras = [
+        c.with_pose(look_at(c.centre, np.zeros(3), rng.normal(size=3))) for c in shots.ring(20)
+    ]
     assert s.up_direction(cameras) is None

@@ -1,4 +1,5 @@
-"""A tiny synthetic capture: what lies where, that it says what it shows, and that it can be taken up again."""
+"""A tiny synthetic capture: what lies where, that it says what it shows, and that it can be taken
+up again."""
 
 import json
 
@@ -6,21 +7,31 @@ import numpy as np
 import pytest
 import trimesh
 
-from relit.capture import synthetic
 from relit.conventions import linear_from_srgb, world_from_cv_camera
 from relit.errors import UserError
 from relit.images import read_data, read_image, write_linear, write_srgb
 from relit.scene import Mesh
+from relit.synthesize import multiview as synthetic
 
-OPTIONS = dict(views=4, test_views=2, resolution=32, spp=16, test_spp=32, seed=3, roughness=0.5, metallic=0.0)
+OPTIONS = dict(
+    views=4, test_views=2, resolution=32, spp=16, test_spp=32, seed=3, roughness=0.5, metallic=0.0
+)
 
 
 def write_ball(folder):
-    """An OBJ of a ball of radius 2 around (5, 1, 0), left half red and right half green by texture."""
+    """An OBJ of a ball of radius 2 around (5, 1, 0), left half red and right half green by
+    texture."""
     ball = trimesh.creation.icosphere(3)
-    uv = np.stack([np.where(ball.vertices[:, 0] < 0, 0.25, 0.75), np.full(len(ball.vertices), 0.5)], 1)
+    uv = np.stack(
+        [np.where(ball.vertices[:, 0] < 0, 0.25, 0.75), np.full(len(ball.vertices), 0.5)], 1
+    )
     v = 2 * ball.vertices + [5, 1, 0]
-    lines = ["mtllib ball.mtl", "usemtl m", *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in v), *(f"vt {a:.4f} {b:.4f}" for a, b in uv)]
+    lines = [
+        "mtllib ball.mtl",
+        "usemtl m",
+        *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in v),
+        *(f"vt {a:.4f} {b:.4f}" for a, b in uv),
+    ]
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in ball.vertices]
     lines += ["f " + " ".join(f"{i}/{i}/{i}" for i in face) for face in ball.faces + 1]
     (folder / "ball.obj").write_text("\n".join(lines) + "\n")
@@ -47,18 +58,27 @@ def ball(tmp_path_factory):
 @pytest.fixture(scope="module")
 def capture(ball, tmp_path_factory):
     asset, light, other = ball
-    return synthetic.synthesize_multiview(asset, light, tmp_path_factory.mktemp("c") / "capture", relights=[other], **OPTIONS)
+    return synthetic.synthesize_multiview(
+        asset, light, tmp_path_factory.mktemp("c") / "capture", relights=[other], **OPTIONS
+    )
 
 
 def test_layout(capture):
     truth = json.loads((capture / "truth" / "truth.json").read_text())
-    assert len(list(capture.glob("train/*.png"))) == 4 and len(list(capture.glob("test/*.png"))) == 2
+    assert (
+        len(list(capture.glob("train/*.png"))) == 4 and len(list(capture.glob("test/*.png"))) == 2
+    )
     for name in ("t_000", "t_001"):
         for tail in ("", "_albedo", "_normal", "_roughness", "_metallic", "_depth"):
             assert (capture / "truth" / "test" / f"{name}{tail}.exr").is_file()
         assert (capture / "truth" / "relight" / "other" / f"{name}.exr").is_file()
     assert (capture / "truth" / "relight" / "other.exr").is_file()
-    assert truth["relight"] == ["other"] and truth["train_albedo"] == ["r_000", "r_001", "r_002", "r_003"]
+    assert truth["relight"] == ["other"] and truth["train_albedo"] == [
+        "r_000",
+        "r_001",
+        "r_002",
+        "r_003",
+    ]
     assert str(capture.parent) not in (capture / "truth" / "truth.json").read_text()  # movable
 
 
@@ -87,11 +107,17 @@ def test_depth_and_normals_are_those_of_the_ball(capture):
     content = json.loads((capture / "transforms_test.json").read_text())
     pose = world_from_cv_camera(np.array(content["frames"][0]["transform_matrix"]))
     focal = 16 / np.tan(content["camera_angle_x"] / 2)
-    depth, normal = (read_data(capture / "truth" / "test" / f"t_000_{k}.exr") for k in ("depth", "normal"))
+    depth, normal = (
+        read_data(capture / "truth" / "test" / f"t_000_{k}.exr") for k in ("depth", "normal")
+    )
     y, x = np.nonzero(normal[..., 3] == 1)
-    p = np.stack([(x + 0.5 - 16) / focal, (y + 0.5 - 16) / focal, np.ones(len(x))], -1) * depth[y, x][:, None]
+    p = (
+        np.stack([(x + 0.5 - 16) / focal, (y + 0.5 - 16) / focal, np.ones(len(x))], -1)
+        * depth[y, x][:, None]
+    )
     world = p @ pose[:3, :3].T + pose[:3, 3]
-    # pixel means against the centre ray: exact in the middle of the ball, near enough away from the rim
+    # pixel means against the centre ray: exact in the middle of the ball, near enough away from the
+    # rim
     facing = (normal[y, x, :3] * -pose[:3, 2]).sum(-1) > 0.5
     radius = synthetic.RADIUS  # of the ball: the farthest vertex stands there
     np.testing.assert_allclose(np.linalg.norm(world[facing], axis=1), radius, atol=0.03)
@@ -104,7 +130,9 @@ def test_the_same_settings_return_at_once_and_others_are_refused(ball, capture):
     synthetic.synthesize_multiview(asset, light, capture, relights=[other], **OPTIONS)
     assert (capture / "truth" / "truth.json").stat().st_mtime_ns == before
     with pytest.raises(UserError, match="other settings"):
-        synthetic.synthesize_multiview(asset, light, capture, relights=[other], **{**OPTIONS, "seed": 4})
+        synthetic.synthesize_multiview(
+            asset, light, capture, relights=[other], **{**OPTIONS, "seed": 4}
+        )
 
 
 def test_a_stopped_rendering_is_taken_up_with_the_same_result(ball, capture):
@@ -125,7 +153,13 @@ def test_wrong_input_is_answered(ball, tmp_path):
     (tmp_path / "mine" / "photo.jpg").write_bytes(b"x")
     with pytest.raises(UserError, match="not empty"):
         synthetic.synthesize_multiview(asset, light, tmp_path / "mine")
-    for wrong in [dict(views=1), dict(spp=0), dict(truth_bsdf="phong"), dict(roughness=1.5), dict(relights=[light, light])]:
+    for wrong in [
+        dict(views=1),
+        dict(spp=0),
+        dict(truth_bsdf="phong"),
+        dict(roughness=1.5),
+        dict(relights=[light, light]),
+    ]:
         with pytest.raises(UserError):
             synthetic.synthesize_multiview(asset, light, tmp_path / "b", **wrong)
     assert not (tmp_path / "b").exists()
@@ -151,7 +185,9 @@ def test_cameras_frame_the_object_and_stand_above_the_table():
 
 
 def test_object_frame_centres_and_scales():
-    mesh = Mesh(np.array([[1, 1, 1], [3, 1, 1], [1, 5, 1]], np.float32), np.array([[0, 1, 2]], np.int32))
+    mesh = Mesh(
+        np.array([[1, 1, 1], [3, 1, 1], [1, 5, 1]], np.float32), np.array([[0, 1, 2]], np.int32)
+    )
     frame = synthetic.object_frame(mesh)
     v = mesh.vertices @ frame[:3, :3].T + frame[:3, 3]
     np.testing.assert_allclose(v.min(0) + v.max(0), 0, atol=1e-12)

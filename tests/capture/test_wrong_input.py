@@ -8,10 +8,12 @@ import shots
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from relit import cli, images
-from relit.capture import open_capture, opening
+from relit import images
+from relit.capture import open as opening
 from relit.capture.frames import read_json
-from relit.capture.middlebury import parse
+from relit.capture.open import open_capture
+from relit.capture.readers.middlebury import parse
+from relit.cli import main as cli
 from relit.errors import EXIT_INPUT, EXIT_USAGE, UserError
 from relit.scene import Sphere
 
@@ -37,7 +39,14 @@ def test_nothing_there(tmp_path):
 def test_no_images_says_what_was_looked_for(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
     error = refused(tmp_path, "no images")
-    for word in ("transforms.json", "cameras_sphere.npz", "_par.txt", "sparse/", "poses_bounds.npy", "notes.txt"):
+    for word in (
+        "transforms.json",
+        "cameras_sphere.npz",
+        "_par.txt",
+        "sparse/",
+        "poses_bounds.npy",
+        "notes.txt",
+    ):
         assert word in error.why
 
 
@@ -50,15 +59,23 @@ def test_one_image(tmp_path):
 def test_photos_cannot_be_shrunk_to_nothing(capture_folder, capsys, side):
     with pytest.raises(UserError, match=f"cannot be shrunk to {side} pixels") as caught:
         open_capture(capture_folder, max_side=side)
-    assert caught.value.code == EXIT_USAGE and "at least 16" in caught.value.why and caught.value.fix
+    assert (
+        caught.value.code == EXIT_USAGE and "at least 16" in caught.value.why and caught.value.fix
+    )
     assert cli.main(["inspect", str(capture_folder), "--max-side", str(side)]) == EXIT_USAGE
     assert "at least 16" in capsys.readouterr().err
 
 
 def test_mixed_sizes(tmp_path, cameras):
-    shots.write_photos(tmp_path / "images", [cameras[0], cameras[1].resized(90, 70), *cameras[2:]], background=shots.BACKGROUND)
+    shots.write_photos(
+        tmp_path / "images",
+        [cameras[0], cameras[1].resized(90, 70), *cameras[2:]],
+        background=shots.BACKGROUND,
+    )
     assert any("2 sizes (5 of 72 x 56, 1 of 90 x 70)" in n for n in open_capture(tmp_path).notes)
-    shots.write_photos(tmp_path / "images", [cameras[0].resized(56, 72)], background=shots.BACKGROUND)
+    shots.write_photos(
+        tmp_path / "images", [cameras[0].resized(56, 72)], background=shots.BACKGROUND
+    )
     names = [f"images/{i:03d}.png" for i in range(6)]
     shots.write_transforms(tmp_path, cameras, names)
     refused(tmp_path, "different shapes: 72 x 56 and 56 x 72")
@@ -67,7 +84,10 @@ def test_mixed_sizes(tmp_path, cameras):
 def test_photos_that_do_not_match_the_cameras(capture_folder):
     for i, file in enumerate(sorted((capture_folder / "images").iterdir())):
         file.rename(file.with_name(f"other{i}.png"))
-    refused(capture_folder, r"6 of 6 photos in transforms.json are not there, for example 'images/000.png'")
+    refused(
+        capture_folder,
+        r"6 of 6 photos in transforms.json are not there, for example 'images/000.png'",
+    )
 
 
 def test_cameras_that_look_away(capture_folder):
@@ -82,14 +102,22 @@ def test_cameras_that_look_away(capture_folder):
 
 
 def test_sphere_outside_the_views(capture_folder):
-    refused(capture_folder, "sphere lies outside the view of . of 6", sphere=Sphere(np.array([0.0, 40.0, 0.0]), 0.5))
+    refused(
+        capture_folder,
+        "sphere lies outside the view of . of 6",
+        sphere=Sphere(np.array([0.0, 40.0, 0.0]), 0.5),
+    )
     refused(capture_folder, "sphere is not valid", sphere=Sphere(np.zeros(3), -1.0))
 
 
-@pytest.mark.parametrize("value, match", [(0.0, "all masks are black"), (1.0, "all masks are white")])
+@pytest.mark.parametrize(
+    "value, match", [(0.0, "all masks are black"), (1.0, "all masks are white")]
+)
 def test_masks_that_say_nothing(capture_folder, value, match):
     for i in range(6):
-        images.write_data(_made(capture_folder / "masks") / f"{i:03d}.png", np.full((56, 72), value))
+        images.write_data(
+            _made(capture_folder / "masks") / f"{i:03d}.png", np.full((56, 72), value)
+        )
     refused(capture_folder, match)
 
 
@@ -100,7 +128,9 @@ def _made(folder):
 
 def test_missing_masks(capture_folder, cameras):
     for i in range(4):
-        images.write_data(_made(capture_folder / "masks") / f"{i:03d}.png", shots.picture(cameras[i])[1])
+        images.write_data(
+            _made(capture_folder / "masks") / f"{i:03d}.png", shots.picture(cameras[i])[1]
+        )
     error = refused(capture_folder, "2 of 6 photos have no mask, for example images/004.png")
     assert "masks/" in error.why
     assert open_capture(capture_folder, masks="none").photos[0].load().mask is None
@@ -111,12 +141,16 @@ def test_inverted_masks_are_turned_with_a_note(capture_folder, cameras):
         images.write_data(_made(capture_folder / "mask") / f"{i}.png", 1 - shots.picture(camera)[1])
     capture = open_capture(capture_folder)
     assert any("inverted" in n for n in capture.notes)
-    np.testing.assert_allclose(capture.photos[2].load().mask, shots.picture(cameras[2])[1], atol=0.01)
+    np.testing.assert_allclose(
+        capture.photos[2].load().mask, shots.picture(cameras[2])[1], atol=0.01
+    )
 
 
 def test_masks_of_0_and_1_are_read_with_a_note(capture_folder, cameras):
     for i, camera in enumerate(cameras):
-        images.write_data(_made(capture_folder / "masks") / f"{i:03d}.png", (shots.picture(camera)[1] > 0.5) / 255)
+        images.write_data(
+            _made(capture_folder / "masks") / f"{i:03d}.png", (shots.picture(camera)[1] > 0.5) / 255
+        )
     capture = open_capture(capture_folder)
     assert any("numbers 0 and 1" in n for n in capture.notes)
     np.testing.assert_array_equal(capture.photos[2].load().mask, shots.picture(cameras[2])[1] > 0.5)
@@ -150,7 +184,10 @@ def test_an_opaque_alpha_channel_is_no_mask(tmp_path, cameras):
     for i, camera in enumerate(cameras):
         rgb, alpha = shots.picture(camera)
         background = np.random.default_rng(i).uniform(size=rgb.shape) * (1 - alpha[..., None])
-        images.write_srgb(tmp_path / f"{i}.png", np.concatenate([rgb + background, np.ones_like(alpha)[..., None]], -1))
+        images.write_srgb(
+            tmp_path / f"{i}.png",
+            np.concatenate([rgb + background, np.ones_like(alpha)[..., None]], -1),
+        )
     capture = open_capture(tmp_path)
     assert capture.photos[0].load().mask is None and not capture.black_background
     assert any("opaque everywhere" in n for n in capture.notes)
@@ -168,15 +205,21 @@ def test_a_mask_of_another_shape(capture_folder):
 def test_a_photo_with_an_empty_mask_is_left_out_with_a_note(capture_folder, cameras, monkeypatch):
     monkeypatch.setattr(opening, "SMALL", 40)  # masks are judged on small copies
     for i, camera in enumerate(cameras):
-        images.write_data(_made(capture_folder / "masks") / f"{i:03d}.png", shots.picture(camera)[1] * (i != 2))
+        images.write_data(
+            _made(capture_folder / "masks") / f"{i:03d}.png", shots.picture(camera)[1] * (i != 2)
+        )
     capture = open_capture(capture_folder)
-    assert len(capture.photos) == 5 and any("1 photos have an empty mask" in n for n in capture.notes)
+    assert len(capture.photos) == 5 and any(
+        "1 photos have an empty mask" in n for n in capture.notes
+    )
 
 
 def test_masks_asked_for_but_not_there(capture_folder):
     refused(capture_folder, "6 of 6 photos have no mask", masks="files")
     refused(capture_folder, "no alpha channel", masks="alpha")
-    with pytest.raises(UserError, match=r"unknown kind of masks 'threshhold'. Did you mean 'threshold'\?"):
+    with pytest.raises(
+        UserError, match=r"unknown kind of masks 'threshhold'. Did you mean 'threshold'\?"
+    ):
         open_capture(capture_folder, masks="threshhold")
 
 
@@ -198,7 +241,9 @@ def test_truncated_jpeg_and_nan(tmp_path):
     refused(exr, "NaN or infinite")
 
 
-@pytest.mark.parametrize("name", ["../../../etc/passwd", "/etc/passwd", "images/../../x.png", "..\\x.png"])
+@pytest.mark.parametrize(
+    "name", ["../../../etc/passwd", "/etc/passwd", "images/../../x.png", "..\\x.png"]
+)
 def test_paths_stay_inside(capture_folder, name):
     edit(capture_folder, lambda data: data["frames"][0].update(file_path=name))
     refused(capture_folder, "outside the capture")
@@ -210,8 +255,14 @@ def test_paths_stay_inside(capture_folder, name):
         (lambda d: d.pop("frames"), "no frames"),
         (lambda d: d["frames"][0].pop("file_path"), "no file_path"),
         (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3]]), "no valid 4 x 4 pose"),
-        (lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "mirrored"),
-        (lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 5, 1, 1]).tolist()), "not a rotation"),
+        (
+            lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
+            "mirrored",
+        ),
+        (
+            lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 5, 1, 1]).tolist()),
+            "not a rotation",
+        ),
         (lambda d: d.pop("fl_x"), "no focal length"),
         (lambda d: d.update(fl_x="wide"), "not a number"),
         (lambda d: d.update(fl_x=-4), "out of range"),
@@ -232,17 +283,36 @@ def test_malformed_json_names_the_place(capture_folder):
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+    ),
     max_leaves=8,
 )
-KEYS = ["fl_x", "fl_y", "cx", "w", "h", "k1", "p1", "camera_angle_x", "camera_model", "is_fisheye", "frames", "test_filenames"]
+KEYS = [
+    "fl_x",
+    "fl_y",
+    "cx",
+    "w",
+    "h",
+    "k1",
+    "p1",
+    "camera_angle_x",
+    "camera_model",
+    "is_fisheye",
+    "frames",
+    "test_filenames",
+]
 
 
 @given(
     st.dictionaries(st.sampled_from(KEYS), values, max_size=4),
-    st.dictionaries(st.sampled_from(["file_path", "transform_matrix", "mask_path", "fl_x"]), values),
+    st.dictionaries(
+        st.sampled_from(["file_path", "transform_matrix", "mask_path", "fl_x"]), values
+    ),
 )
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_any_json_is_read_or_refused(tmp_path, head, first):
     if not (tmp_path / "images").exists():
         shots.write_photos(tmp_path / "images", shots.ring(3), background=shots.BACKGROUND)
@@ -273,7 +343,9 @@ def test_any_parameter_file_is_read_or_refused(text):
 
 
 @given(st.binary(max_size=60))
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_any_bytes_as_json_are_read_or_refused(tmp_path, data):
     (tmp_path / "x.json").write_bytes(data)
     try:

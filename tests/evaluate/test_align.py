@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from relit.capture.synthetic import orbit_cameras
 from relit.conventions import move_points, move_pose, similarity
 from relit.errors import UserError
-from relit.evaluate.align import align_cameras, pose_errors, rotation_angle, same_frame, umeyama
+from relit.evaluate.alignment import align_cameras, pose_errors, rotation_angle, same_frame, umeyama
+from relit.synthesize.multiview import orbit_cameras
 
-KNOWN = similarity(Rotation.from_euler("xyz", [40, -75, 130], degrees=True).as_matrix(), [0.4, -2.0, 5.0], 3.7)
+KNOWN = similarity(
+    Rotation.from_euler("xyz", [40, -75, 130], degrees=True).as_matrix(), [0.4, -2.0, 5.0], 3.7
+)
 
 
 def test_umeyama_finds_a_known_similarity():
@@ -32,7 +34,10 @@ def test_umeyama_refuses_what_is_not_determined():
 def test_cameras_in_another_frame():
     truth = dict(orbit_cameras(9, 32))
     inverse = np.linalg.inv(KNOWN)
-    recovered = {name: c.with_pose(move_pose(inverse, c.world_from_camera)) for name, c in list(truth.items())[2:]}
+    recovered = {
+        name: c.with_pose(move_pose(inverse, c.world_from_camera))
+        for name, c in list(truth.items())[2:]
+    }
     assert not same_frame(recovered, truth) and same_frame(truth, truth)
     s = align_cameras(recovered, truth)
     np.testing.assert_allclose(s, KNOWN, atol=1e-8)
@@ -45,7 +50,10 @@ def test_an_arc_of_cameras_fixes_the_rotation():
     for i, angle in enumerate(np.linspace(-0.2, 0.2, 5)):  # centres on a straight line
         pose = similarity(Rotation.from_euler("y", -angle).as_matrix(), [10 * angle, 0, -4])
         truth[f"{i}"] = orbit_cameras(1, 32)[0][1].with_pose(pose)
-    recovered = {name: c.with_pose(move_pose(np.linalg.inv(KNOWN), c.world_from_camera)) for name, c in truth.items()}
+    recovered = {
+        name: c.with_pose(move_pose(np.linalg.inv(KNOWN), c.world_from_camera))
+        for name, c in truth.items()
+    }
     np.testing.assert_allclose(align_cameras(recovered, truth), KNOWN, atol=1e-8)
 
 

@@ -1,4 +1,5 @@
-"""Evaluation of flash photos that nothing true is known of: held-out ones under the recovered flash, which moves with their cameras."""
+"""Evaluation of flash photos that nothing true is known of: held-out ones under the recovered
+flash, which moves with their cameras."""
 
 from dataclasses import replace
 
@@ -8,15 +9,16 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from relit.asset.asset import save_asset
-from relit.cameras.se3 import look_at
-from relit.capture.synthetic_flash import _write_cameras
 from relit.conventions import move_pose, similarity
 from relit.evaluate import photos
-from relit.evaluate.protocols import aligned, evaluate
+from relit.evaluate.alignment import aligned
+from relit.evaluate.dispatch import evaluate
+from relit.geometry.se3 import look_at
 from relit.images import write_data, write_linear
-from relit.rendering.flash_scene import build_flash_scene, render_flash
-from relit.rendering.photographed import FLASH_DEPTH
+from relit.reference.flash_scene import build_flash_scene, render_flash
+from relit.reference.photographed import FLASH_DEPTH
 from relit.scene import Asset, Camera, Flash, Material, Mesh
+from relit.synthesize.flash import _write_cameras
 
 SIZE, SPP = 40, 64
 PLACES = [(3, 0.5, 0), (0, 0.8, 3), (-3, -0.5, 0.2), (0.3, 0.6, -3), (2, 1.5, 2), (-2, 1, 1.8)]
@@ -33,8 +35,19 @@ def plastic(device) -> Asset:
     one = np.ones((1, 1), np.float32)
     material = Material(base, 0.45 * one, 0 * one, 1.49, 0.8 * one, diffuse=base)
     flash = Flash(np.array([-0.6, 0.2, 0.0]), np.full(3, 20.0))
-    cameras = tuple((f"{i}.exr", Camera(SIZE, SIZE, 50.0, 50.0, SIZE / 2, SIZE / 2, look_at(np.array(o)))) for i, o in enumerate(PLACES))
-    return Asset(Mesh(v, ball.faces.astype(np.int32), n, uvs), material, np.eye(4), None, cameras, {"material": "rough_plastic"}, flash)
+    cameras = tuple(
+        (f"{i}.exr", Camera(SIZE, SIZE, 50.0, 50.0, SIZE / 2, SIZE / 2, look_at(np.array(o))))
+        for i, o in enumerate(PLACES)
+    )
+    return Asset(
+        Mesh(v, ball.faces.astype(np.int32), n, uvs),
+        material,
+        np.eye(4),
+        None,
+        cameras,
+        {"material": "rough_plastic"},
+        flash,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +56,10 @@ def capture(plastic, tmp_path_factory):
     folder = tmp_path_factory.mktemp("flash")
     scene = build_flash_scene(plastic.mesh, plastic.material)
     for split, some in (("train", plastic.cameras[:4]), ("test", plastic.cameras[4:])):
-        _write_cameras(folder / split / "cam_dict_norm.json", [(name.removesuffix(".exr"), c) for name, c in some])
+        _write_cameras(
+            folder / split / "cam_dict_norm.json",
+            [(name.removesuffix(".exr"), c) for name, c in some],
+        )
         for name, camera in some:
             picture = render_flash(scene, camera, plastic.flash, SPP, seed=7, max_depth=FLASH_DEPTH)
             write_linear(folder / split / "image" / name, picture[..., :3])
@@ -63,15 +79,24 @@ def test_the_asset_that_was_photographed(plastic, capture, tmp_path):
     assert got["held_out_psnr_masked"] > 33 and got["held_out_mask_iou"] > 0.95
     assert "recovered moving flash" in result["metrics"]["held_out_psnr"]["definition"]
     at_camera = replace(plastic, flash=replace(plastic.flash, offset=np.zeros(3)))
-    assert figures(photos.evaluate_on_photos(at_camera, capture, spp=SPP))["held_out_psnr_masked"] < got["held_out_psnr_masked"] - 5
+    assert (
+        figures(photos.evaluate_on_photos(at_camera, capture, spp=SPP))["held_out_psnr_masked"]
+        < got["held_out_psnr_masked"] - 5
+    )
 
 
 def test_the_flash_follows_into_the_frame_of_the_photos(plastic, capture):
     free = similarity(Rotation.from_euler("y", 90, degrees=True).as_matrix(), [1, 2, 3], 0.25)
-    cameras = tuple((name, c.with_pose(move_pose(free, c.world_from_camera))) for name, c in plastic.cameras[:4])
+    cameras = tuple(
+        (name, c.with_pose(move_pose(free, c.world_from_camera))) for name, c in plastic.cameras[:4]
+    )
     flash = Flash(plastic.flash.offset * 0.25, plastic.flash.intensity * 0.25**2)
     moved = replace(plastic, world_from_asset=free, cameras=cameras, flash=flash)
     back, how = aligned(moved, {k: c for k, c in plastic.cameras[:4]}, dict(cameras))
-    assert how == "sim3" and np.allclose(back.flash.offset, plastic.flash.offset) and np.allclose(back.flash.intensity, 20)
+    assert (
+        how == "sim3"
+        and np.allclose(back.flash.offset, plastic.flash.offset)
+        and np.allclose(back.flash.intensity, 20)
+    )
     result = photos.evaluate_on_photos(moved, capture, spp=SPP)
     assert result["alignment"] == "sim3" and figures(result)["held_out_psnr_masked"] > 33

@@ -19,7 +19,9 @@ def test_psnr_inside_a_mask_ignores_the_rest():
     inside = np.zeros((4, 4), bool)
     inside[:2] = True
     assert m.psnr(a, b, inside) == pytest.approx(20.0)
-    assert m.psnr(a, b) == pytest.approx(20.0 + 10 * np.log10(2))  # half of the pixels are without error
+    assert m.psnr(a, b) == pytest.approx(
+        20.0 + 10 * np.log10(2)
+    )  # half of the pixels are without error
     assert np.isnan(m.psnr(a, b, np.zeros((4, 4), bool)))
 
 
@@ -45,7 +47,15 @@ def test_ssim_agrees_with_scikit_image():
     a = rng.random((40, 40))
     b = np.clip(a + 0.1 * rng.normal(size=a.shape), 0, 1)
     ours = m.ssim_map(a, b)
-    theirs = structural_similarity(a, b, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True)[1]
+    theirs = structural_similarity(
+        a,
+        b,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )[1]
     np.testing.assert_allclose(ours[6:-6, 6:-6], theirs[6:-6, 6:-6], atol=1e-7)
 
 
@@ -74,16 +84,30 @@ def test_surface_samples_are_uniform_by_area():
     assert points.min() >= 0 and (points <= [3, 1, 0]).all()
     np.testing.assert_allclose(points.mean(0), [1.5, 0.5, 0.0], atol=0.02)
     np.testing.assert_allclose(points.var(0), [9 / 12, 1 / 12, 0], atol=0.02)
-    assert ((points[:, 1] < points[:, 0] / 3) == (surface.triangle[surface.uniform] == 0)).mean() > 0.999
+    assert (
+        (points[:, 1] < points[:, 0] / 3) == (surface.triangle[surface.uniform] == 0)
+    ).mean() > 0.999
 
 
 def test_nearest_point_of_a_triangle_inside_at_an_edge_and_at_a_corner():
     a, b, c = (np.array(x, float) for x in ([0, 0, 0], [4, 0, 0], [0, 4, 0]))
-    cases = {(1, 1, 2): (1, 1, 0), (2, -3, 1): (2, 0, 0), (3, 3, -1): (2, 2, 0), (-1, -2, 5): (0, 0, 0), (9, -1, 0): (4, 0, 0)}
+    cases = {
+        (1, 1, 2): (1, 1, 0),
+        (2, -3, 1): (2, 0, 0),
+        (3, 3, -1): (2, 2, 0),
+        (-1, -2, 5): (0, 0, 0),
+        (9, -1, 0): (4, 0, 0),
+    }
     for point, nearest in cases.items():
-        np.testing.assert_allclose(m.closest_on_triangles(np.array(point, float), a, b, c), nearest, atol=1e-12)
-        np.testing.assert_allclose(m.closest_on_triangles(np.array(point, float), a, c, b), nearest, atol=1e-12)  # either winding
-    np.testing.assert_allclose(m.closest_on_triangles(np.array([1.0, 1, 0]), a, b, b), [1, 0, 0])  # no area: an edge is left
+        np.testing.assert_allclose(
+            m.closest_on_triangles(np.array(point, float), a, b, c), nearest, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            m.closest_on_triangles(np.array(point, float), a, c, b), nearest, atol=1e-12
+        )  # either winding
+    np.testing.assert_allclose(
+        m.closest_on_triangles(np.array([1.0, 1, 0]), a, b, b), [1, 0, 0]
+    )  # no area: an edge is left
 
 
 def test_chamfer_of_spheres():
@@ -97,7 +121,8 @@ def test_chamfer_of_spheres():
     mean, out, back = m.chamfer(a, larger)
     assert mean == pytest.approx(0.1, rel=0.01) and mean == pytest.approx((out + back) / 2)
     half = b.only(b.points[:, 2] > 0)
-    # from latitude t of the missing half the equator is a chord of 2 sin(t / 2) away: its mean over the hemisphere, weight cos(t) dt
+    # from latitude t of the missing half the equator is a chord of 2 sin(t / 2) away: its mean over
+    # the hemisphere, weight cos(t) dt
     missing = 2 / 3 * (1 + np.sqrt(0.5)) - 2 * (1 - np.sqrt(0.5))
     _, accuracy, completeness = m.chamfer(half, a)
     assert accuracy < 2e-4 and completeness == pytest.approx(missing / 2, rel=0.03)
@@ -106,7 +131,9 @@ def test_chamfer_of_spheres():
 def test_environment_figures():
     a = np.full((16, 32, 3), 0.25, np.float32)
     assert m.environment_mse(a, a) == 0.0
-    assert m.environment_mse(a, np.ones((64, 128, 3))) == pytest.approx((1 - 0.25 ** (1 / 2.2)) ** 2, rel=1e-4)
+    assert m.environment_mse(a, np.ones((64, 128, 3))) == pytest.approx(
+        (1 - 0.25 ** (1 / 2.2)) ** 2, rel=1e-4
+    )
     assert m.environment_log_rmse(4 * a, a) == pytest.approx(2.0, rel=1e-5)
     # a lamp above the clipping point: only the logarithmic figure sees its strength
     lamp, stronger = a.copy(), a.copy()

@@ -1,22 +1,33 @@
-"""A recovered pile laid on the true one: the scale about the camera, whatever frame and size the object was given."""
+"""A recovered pile laid on the true one: the scale about the camera, whatever frame and size the
+object was given."""
 
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
 from relit.evaluate.pile_alignment import grown_about, object_turn, scale_about
+from relit.geometry.se3 import exp_so3
 
 CENTRE, MIDDLE = np.array([1.0, 2.0, -3.0]), np.array([0.4, -0.2, 0.1])
-FRAME = similarity(exp_so3(np.array([0.4, -1.1, 0.6])), np.array([0.3, 0.1, -0.2]), 1.7)  # recovered from true object
+FRAME = similarity(
+    exp_so3(np.array([0.4, -1.1, 0.6])), np.array([0.3, 0.1, -0.2]), 1.7
+)  # recovered from true object
 
 
 def piles(scale, count=10, along=0.0, seed=0):
-    """True poses, and the recovered ones: nearer to the camera by the scale, in another frame of the object, and each with an error along
-    its line of sight, a part of its distance."""
+    """True poses, and the recovered ones: nearer to the camera by the scale, in another frame of
+    the object, and each with an error along its line of sight, a part of its distance."""
     rng = np.random.default_rng(seed)
-    true = {k: similarity(exp_so3(rng.normal(size=3)), CENTRE + np.array([0, 0, 12]) + rng.uniform(-3, 3, 3), 0.8) for k in range(count)}
-    found = {k: grown_about(CENTRE, (1 + along * rng.normal()) / scale) @ p @ np.linalg.inv(FRAME) for k, p in true.items()}
+    true = {
+        k: similarity(
+            exp_so3(rng.normal(size=3)), CENTRE + np.array([0, 0, 12]) + rng.uniform(-3, 3, 3), 0.8
+        )
+        for k in range(count)
+    }
+    found = {
+        k: grown_about(CENTRE, (1 + along * rng.normal()) / scale) @ p @ np.linalg.inv(FRAME)
+        for k, p in true.items()
+    }
     return found, true
 
 

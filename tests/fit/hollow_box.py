@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from relit.cameras.se3 import look_at
-from relit.fit.lids import FIRST, THEN
+from relit.fit.shape.lids import FIRST, THEN
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
+from relit.geometry.se3 import look_at
 from relit.scene import Camera
 
 N, SIZE = 40, 72
@@ -34,21 +34,28 @@ def pictures(inside):
     """Photos of a shape, striped inside and out: (rgb, coverage) of each camera."""
     import mitsuba as mi
 
-    from relit.fit.register import volume_render
-    from relit.fit.volume import start_model
+    from relit.fit.passes.volume import start_model
+    from relit.fit.registration.register import volume_render
 
     model = start_model(distance_of(inside), LEVEL, None, full=True)
-    stripes = [0.3 + 0.25 * np.sin(k * P[..., 0] + 1) * np.cos(k * P[..., c]) for k, c in ((14, 2), (12, 1), (13, 2))]
+    stripes = [
+        0.3 + 0.25 * np.sin(k * P[..., 0] + 1) * np.cos(k * P[..., c])
+        for k, c in ((14, 2), (12, 1), (13, 2))
+    ]
     colours = np.stack([*stripes, 0 * stripes[0]], -1)
-    model.grid.features = mi.Float(np.concatenate([np.zeros((1, 4)), colours.reshape(-1, 4)]).astype(np.float32).ravel())
+    model.grid.features = mi.Float(
+        np.concatenate([np.zeros((1, 4)), colours.reshape(-1, 4)]).astype(np.float32).ravel()
+    )
     model.inv_s = 3.0 / model.grid.h
     return volume_render(model)(cameras())
 
 
 def photographed(inside):
     """The bank of the photos of a shape, and a start for fits."""
-    from relit.fit.pixels import make_bank
-    from relit.fit.volume import start_model
+    from relit.fit.passes.pixels import make_bank
+    from relit.fit.passes.volume import start_model
 
     rgb, alpha = pictures(inside)
-    return make_bank(cameras(), list(rgb), list(alpha)), lambda values: start_model(values, LEVEL, None, full=True)
+    return make_bank(cameras(), list(rgb), list(alpha)), lambda values: start_model(
+        values, LEVEL, None, full=True
+    )

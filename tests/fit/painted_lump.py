@@ -3,11 +3,11 @@
 import numpy as np
 import trimesh
 
-from relit.cameras.se3 import exp_so3
-from relit.fit.joint_alignment import turned
-from relit.fit.outlines import trace
-from relit.fit.texture_shifts import shown_by
-from relit.rendering.mitsuba_scene import build_geometry
+from relit.fit.shape.alignment import turned
+from relit.fit.shape.outlines import trace
+from relit.fit.shape.texture_shifts import shown_by
+from relit.geometry.se3 import exp_so3
+from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
 SIZE, FOCAL = 160, 400.0
@@ -17,10 +17,16 @@ def lump() -> Mesh:
     """An egg with bumps: its outlines tell poses, its surface is not a sphere's."""
     shape = trimesh.creation.icosphere(4, 1.0)
     v = np.asarray(shape.vertices)
-    radius = 0.45 * (1 + 0.15 * np.sin(3 * v[:, :1] + 1) * np.cos(4 * v[:, 1:2]) + 0.1 * np.sin(5 * v[:, 2:]))
+    radius = 0.45 * (
+        1 + 0.15 * np.sin(3 * v[:, :1] + 1) * np.cos(4 * v[:, 1:2]) + 0.1 * np.sin(5 * v[:, 2:])
+    )
     v = v * radius * [1.25, 0.85, 1.0]
     made = trimesh.Trimesh(v, shape.faces, process=False)
-    return Mesh(v.astype(np.float32), np.asarray(shape.faces, np.int32), np.asarray(made.vertex_normals, np.float32))
+    return Mesh(
+        v.astype(np.float32),
+        np.asarray(shape.faces, np.int32),
+        np.asarray(made.vertex_normals, np.float32),
+    )
 
 
 def colours(points: np.ndarray) -> np.ndarray:
@@ -40,7 +46,8 @@ def camera_at(direction, turn) -> Camera:
 
 
 def shown(mesh: Mesh, cameras: list[Camera], paint=colours):
-    """(pictures, masks) of the mesh, each under another light. paint: colours (..., 3) of points (..., 3)."""
+    """(pictures, masks) of the mesh, each under another light. paint: colours (..., 3) of points
+    (..., 3)."""
     scene = build_geometry(mesh)
     pictures, masks = [], []
     part = (np.arange(4) + 0.5) / 4
@@ -50,7 +57,9 @@ def shown(mesh: Mesh, cameras: list[Camera], paint=colours):
         seen = shown_by(mesh, scene, camera, np.ones((SIZE, SIZE), np.float32))
         brightness = 0.6 + 0.3 * np.sin(0.02 * x + k)[..., None]
         picture = np.full((SIZE, SIZE, 3), 0.1, np.float32)
-        picture[seen.hit] = (np.broadcast_to(brightness, picture.shape)[seen.hit] * paint(seen.point)).astype(np.float32)
+        picture[seen.hit] = (
+            np.broadcast_to(brightness, picture.shape)[seen.hit] * paint(seen.point)
+        ).astype(np.float32)
         pictures.append(picture)
         hit = np.isfinite(trace(scene, camera, at[0].ravel(), at[1].ravel())[0])
         masks.append(hit.reshape(SIZE, SIZE, 16).mean(-1).astype(np.float32))

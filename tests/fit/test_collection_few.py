@@ -4,21 +4,23 @@ import numpy as np
 import pytest
 from volume_lump import photos_of, volume_lump
 
-from relit.cameras.se3 import camera_errors, exp_so3
 from relit.geometry.hull import NoShape
+from relit.geometry.se3 import camera_errors, exp_so3
 
 pytest.importorskip("mitsuba")
 
 
 @pytest.fixture(scope="module")
 def photos():
-    return photos_of(volume_lump(), 6, np.random.default_rng(4), turn=0.1)  # hints are of photos that are held upright
+    return photos_of(
+        volume_lump(), 6, np.random.default_rng(4), turn=0.1
+    )  # hints are of photos that are held upright
 
 
 @pytest.fixture(scope="module")
 def crops(photos):
-    from relit.fit.collection_poses import even_colours
-    from relit.fit.register import crop_photo
+    from relit.fit.registration.photos.poses import even_colours
+    from relit.fit.registration.register import crop_photo
 
     return even_colours([crop_photo(*p) for p in photos])
 
@@ -32,7 +34,7 @@ def quiet(*_):
 
 
 def test_right_poses_have_less_misfit_than_wrong_ones(photos, crops, monkeypatch):
-    from relit.fit import collection_few as few
+    from relit.fit.registration.photos import few
 
     monkeypatch.setattr(few, "NODES", 32)
     monkeypatch.setattr(few, "STEPS", 80)
@@ -42,18 +44,25 @@ def test_right_poses_have_less_misfit_than_wrong_ones(photos, crops, monkeypatch
 
 
 @pytest.mark.parametrize(("score", "taken"), [(0.95, 1), (0.9, 0)])
-def test_the_way_that_explains_the_photos_is_taken_unless_it_lost_some(crops, monkeypatch, score, taken):
-    from relit.fit import collection_few as few
+def test_the_way_that_explains_the_photos_is_taken_unless_it_lost_some(
+    crops, monkeypatch, score, taken
+):
+    from relit.fit.registration.photos import few
 
     ends = np.zeros((len(crops), 4, 4)), np.ones((len(crops), 4, 4))
     monkeypatch.setattr(few, "misfit", lambda _, poses, __: 0.2 if poses is ends[0] else 0.1)
-    ways = {"one": lambda: (ends[0], np.full(len(crops), 0.99)), "two": lambda: (ends[1], np.full(len(crops), score))}
+    ways = {
+        "one": lambda: (ends[0], np.full(len(crops), 0.99)),
+        "two": lambda: (ends[1], np.full(len(crops), score)),
+    }
     assert few.best_way(crops, ways, 0, quiet)[0] is ends[taken]
 
 
-@pytest.mark.parametrize(("heights", "ends"), [((0.9, 0.92, 0.93), 2), ((0.9, 0.87, 0.88), 2), ((0.9, 0.91, 0.8), 1)])
+@pytest.mark.parametrize(
+    ("heights", "ends"), [((0.9, 0.92, 0.93), 2), ((0.9, 0.87, 0.88), 2), ((0.9, 0.91, 0.8), 1)]
+)
 def test_a_search_that_loses_photos_is_taken_back(monkeypatch, heights, ends):
-    from relit.fit import collection_few as few
+    from relit.fit.registration.photos import few
 
     asked = []
 
@@ -67,24 +76,33 @@ def test_a_search_that_loses_photos_is_taken_back(monkeypatch, heights, ends):
 
 
 def test_ways_that_fail_are_passed_over(crops, monkeypatch):
-    from relit.fit import collection_few as few
+    from relit.fit.registration.photos import few
 
     def fails():
         raise NoShape("nothing in common")
 
     a = np.zeros((len(crops), 4, 4))
     monkeypatch.setattr(few, "misfit", lambda *_: 0.2)
-    assert few.best_way(crops, {"no": fails, "yes": lambda: (a, np.ones(len(crops)))}, 0, quiet)[0] is a
+    assert (
+        few.best_way(crops, {"no": fails, "yes": lambda: (a, np.ones(len(crops)))}, 0, quiet)[0]
+        is a
+    )
     with pytest.raises(NoShape, match="nothing in common"):
         few.best_way(crops, {"no": fails}, 0, quiet)
 
 
 def test_few_photos_end_nearer_than_their_hints(photos, crops):
-    from relit.fit.collection_few import few_from_hints
-    from relit.fit.collection_poses import pose_towards, schedule_of
+    from relit.fit.registration.photos.few import few_from_hints
+    from relit.fit.registration.photos.poses import pose_towards, schedule_of
 
     right, rng = true_poses(photos), np.random.default_rng(1)
-    hints = np.array([exp_so3(np.radians(15) * rng.normal(size=3) / np.sqrt(3)) @ (p[:3, 3] / np.linalg.norm(p[:3, 3])) for p in right])
+    hints = np.array(
+        [
+            exp_so3(np.radians(15) * rng.normal(size=3) / np.sqrt(3))
+            @ (p[:3, 3] / np.linalg.norm(p[:3, 3]))
+            for p in right
+        ]
+    )
     begin = np.array([pose_towards(c, h) for c, h in zip(crops, hints, strict=True)])
     poses, scores = few_from_hints(crops, hints, 45.0, schedule_of(2), 1, 0, quiet, 1)
     before, after = camera_errors(begin, right)[0], camera_errors(poses, right)[0]
@@ -105,7 +123,7 @@ def test_few_photos_end_nearer_than_their_hints(photos, crops):
 )
 def test_which_photos_are_few(crops, monkeypatch, count, hinted, linked, cycles, few):
     """Photos of which some have hints, photos that matches link, and many photos go the one way."""
-    from relit.fit import collection_growth as growth
+    from relit.fit.registration.photos import growth
 
     some, taken = (crops * 5)[:count], []
     poses, scores = np.tile(np.eye(4), (count, 1, 1)), np.ones(count)
@@ -113,7 +131,13 @@ def test_which_photos_are_few(crops, monkeypatch, count, hinted, linked, cycles,
     def way(name):
         return lambda *_, **__: (taken.append(name), (poses, scores))[1]
 
-    for name in ("few_from_hints", "few_by_growth", "poses_from_hints", "poses_by_growth", "polish"):
+    for name in (
+        "few_from_hints",
+        "few_by_growth",
+        "poses_from_hints",
+        "poses_by_growth",
+        "polish",
+    ):
         said = {"few_from_hints": "hints", "few_by_growth": "growth"}.get(name, "")
         monkeypatch.setattr(growth, name, way(said))
     directions = np.zeros((count, 3))
@@ -124,13 +148,22 @@ def test_which_photos_are_few(crops, monkeypatch, count, hinted, linked, cycles,
 
 
 def test_a_shape_seen_from_one_side_does_not_reach_far_behind(crops):
-    """The search is told how deep the object may be; photos from all around are left to their outlines."""
-    from relit.fit.collection_depth import depth_limit
-    from relit.fit.collection_poses import coarse_model, gauge, pose_towards
+    """The search is told how deep the object may be; photos from all around are left to their
+    outlines."""
+    from relit.fit.registration.photos.depth import depth_limit
+    from relit.fit.registration.photos.poses import coarse_model, gauge, pose_towards
     from relit.geometry.sdf import dense_values, node_positions
 
     turns = np.radians([-30, -10, 10, 30, 0, 15])
-    poses = gauge(crops, np.array([pose_towards(c, np.array([np.sin(a), 0.1, np.cos(a)])) for c, a in zip(crops, turns, strict=True)]))
+    poses = gauge(
+        crops,
+        np.array(
+            [
+                pose_towards(c, np.array([np.sin(a), 0.1, np.cos(a)]))
+                for c, a in zip(crops, turns, strict=True)
+            ]
+        ),
+    )
     p = node_positions(24)
 
     def depth(limit):

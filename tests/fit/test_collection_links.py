@@ -1,4 +1,5 @@
-"""Matches between photos as evidence: pycolmap on rendered photos, groups in the object's frame, votes; and photos that the frame cuts."""
+"""Matches between photos as evidence: pycolmap on rendered photos, groups in the object's frame,
+votes; and photos that the frame cuts."""
 
 from dataclasses import replace
 
@@ -9,13 +10,15 @@ mi = pytest.importorskip("mitsuba")
 
 
 def texture_ball(direction, side=220, field=1.1):
-    """(rgb, mask, world_from_camera, focal): a ball with a fine pattern, seen from `direction` at distance 3. field: focal
-    length over side."""
-    from relit.cameras.se3 import look_at
+    """(rgb, mask, world_from_camera, focal): a ball with a fine pattern, seen from `direction` at
+    distance 3. field: focal length over side."""
+    from relit.geometry.se3 import look_at
 
     pose = look_at(np.asarray(direction) / np.linalg.norm(direction) * 3)
     focal = side * field
-    x, y = np.meshgrid((np.arange(side) + 0.5 - side / 2) / focal, (np.arange(side) + 0.5 - side / 2) / focal)
+    x, y = np.meshgrid(
+        (np.arange(side) + 0.5 - side / 2) / focal, (np.arange(side) + 0.5 - side / 2) / focal
+    )
     d = np.stack([x, y, np.ones_like(x)], -1)
     d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ pose[:3, :3].T
     o = pose[:3, 3]
@@ -40,23 +43,28 @@ def arc(count, step=14.0):
 def test_photos_of_one_ball_are_linked_whatever_their_light(tmp_path):
     pytest.importorskip("pycolmap")
     from relit.cameras.links import link_photos
-    from relit.cameras.se3 import camera_errors
+    from relit.geometry.se3 import camera_errors
 
     shots = [texture_ball(d, 260) for d in arc(8, 9.0)]
     lights = np.random.default_rng(2).uniform(0.5, 1.5, (8, 3))
     noise = np.random.default_rng(3).uniform(0, 1, (9, 260, 260, 3)).astype(np.float32)
-    photos = [(s[0] * light + n * (1 - s[1][..., None]), s[1], s[3]) for s, n, light in zip(shots, noise, lights, strict=False)]
+    photos = [
+        (s[0] * light + n * (1 - s[1][..., None]), s[1], s[3])
+        for s, n, light in zip(shots, noise, lights, strict=False)
+    ]
     photos.append((noise[8], shots[0][1], 0.0))  # something else within the same outline
     said = []
     groups = link_photos(photos, tmp_path / "links", 1, said.append)
-    assert len(groups) >= 1 and set(groups[0].photos) <= set(range(8)) and len(groups[0].photos) >= 4
+    assert (
+        len(groups) >= 1 and set(groups[0].photos) <= set(range(8)) and len(groups[0].photos) >= 4
+    )
     truth = np.array([shots[i][2] for i in groups[0].photos])
     assert np.median(camera_errors(groups[0].poses, truth)[0]) < 4
     assert "of 9 photos are linked" in said[-1] and not (tmp_path / "links").exists()
 
 
 def shots_of(count, step=40.0, side=64, field=1.1):
-    from relit.fit.collection_photos import Shot
+    from relit.fit.collection.photos import Shot
     from relit.scene import Camera, Photo
 
     out, poses = [], []
@@ -70,7 +78,7 @@ def shots_of(count, step=40.0, side=64, field=1.1):
 
 def turned(poses, rng, scale=3.0):
     """The poses in another frame: (poses, rotation that was applied)."""
-    from relit.cameras.se3 import nearest_rotation
+    from relit.geometry.se3 import nearest_rotation
 
     r = nearest_rotation(rng.normal(size=(3, 3)))
     out = poses.copy()
@@ -81,8 +89,8 @@ def turned(poses, rng, scale=3.0):
 
 def test_a_group_is_put_into_the_hints_frame():
     from relit.cameras.links import Group
-    from relit.cameras.se3 import rotation_angle
-    from relit.fit.collection_links import placed
+    from relit.fit.collection.links import placed
+    from relit.geometry.se3 import rotation_angle
 
     shots, poses = shots_of(8)
     other, _ = turned(poses, np.random.default_rng(3))
@@ -90,15 +98,19 @@ def test_a_group_is_put_into_the_hints_frame():
     hints = poses[:, :3, 3] / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
     found, angle = placed(group, shots, hints)
     assert angle < 5
-    assert max(rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(found, poses, strict=True)) < 6
+    assert (
+        max(rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(found, poses, strict=True)) < 6
+    )
     distance = np.linalg.norm(found[:, :3, 3], axis=1)
-    assert np.allclose(distance, 3 * 0.88, rtol=0.2)  # the ball of radius 1 fills .88 of the unit sphere; its hull is larger
+    assert np.allclose(
+        distance, 3 * 0.88, rtol=0.2
+    )  # the ball of radius 1 fills .88 of the unit sphere; its hull is larger
 
 
 def test_a_group_outvotes_a_photo_that_stands_elsewhere():
     from relit.cameras.links import Group
-    from relit.cameras.se3 import rotation_angle
-    from relit.fit.collection_links import consensus
+    from relit.fit.collection.links import consensus
+    from relit.geometry.se3 import rotation_angle
 
     _, poses = shots_of(6)
     other, _ = turned(poses, np.random.default_rng(4))
@@ -107,18 +119,21 @@ def test_a_group_outvotes_a_photo_that_stands_elsewhere():
     present[2, :3, :3] = present[2, :3, :3] @ np.diag([-1.0, 1, -1])
     wanted = consensus(group, present)
     assert max(rotation_angle(a.T @ b[:3, :3]) for a, b in zip(wanted, poses, strict=True)) < 1
-    scattered = np.array([turned(p[None], np.random.default_rng(9 + i))[0][0] for i, p in enumerate(poses)])
+    scattered = np.array(
+        [turned(p[None], np.random.default_rng(9 + i))[0][0] for i, p in enumerate(poses)]
+    )
     assert consensus(group, scattered) is None
 
 
 def test_a_cut_photo_is_found_with_place_and_scale_free():
-    """The lower half of the picture is outside the frame: the whole silhouette's middle and size say nothing."""
+    """The lower half of the picture is outside the frame: the whole silhouette's middle and size
+    say nothing."""
     from lump import lump
 
-    from relit.cameras.se3 import look_at, rotation_angle
-    from relit.fit.collection_framing import is_cut, not_empty, slide
-    from relit.fit.register import crop_photo, views_from
-    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.fit.registration.photos.framing import is_cut, not_empty, slide
+    from relit.fit.registration.register import crop_photo, views_from
+    from relit.geometry.se3 import look_at, rotation_angle
+    from relit.reference.mitsuba_scene import build_scene, render
     from relit.scene import Camera
 
     mesh, material = lump()
@@ -136,7 +151,10 @@ def test_a_cut_photo_is_found_with_place_and_scale_free():
     rows = np.flatnonzero((alpha > 0.5).any(1))
     bottom = int(rows[0] + 0.6 * (rows[-1] - rows[0]))
     cut = Camera(96, bottom, 140, 140, 48, 48, np.eye(4))
-    crop, whole = crop_photo(rgb[:bottom], alpha[:bottom], cut), crop_photo(rgb, alpha, camera.with_pose(np.eye(4)))
+    crop, whole = (
+        crop_photo(rgb[:bottom], alpha[:bottom], cut),
+        crop_photo(rgb, alpha, camera.with_pose(np.eye(4))),
+    )
     assert is_cut(crop) and not is_cut(whole)
     assert not_empty([crop])[0].sum() > not_empty([whole])[0].sum()
     found = slide([crop], picture, views, 2)
@@ -146,13 +164,14 @@ def test_a_cut_photo_is_found_with_place_and_scale_free():
 
 
 @pytest.mark.parametrize(
-    ("photos", "linked", "begins"), [(6, 6, True), (6, 4, False), (4, 4, True), (4, 3, False), (60, 8, True), (60, 7, False)]
+    ("photos", "linked", "begins"),
+    [(6, 6, True), (6, 4, False), (4, 4, True), (4, 3, False), (60, 8, True), (60, 7, False)],
 )
 def test_from_how_many_linked_photos_a_shape_begins(monkeypatch, photos, linked, begins):
     """Eight are enough; of few photos nearly all have to be linked."""
     from relit.cameras.links import Group
     from relit.errors import UserError
-    from relit.fit import collection_links as links
+    from relit.fit.collection import links
 
     asked = []
 
@@ -161,13 +180,25 @@ def test_from_how_many_linked_photos_a_shape_begins(monkeypatch, photos, linked,
         raise UserError("far enough")
 
     monkeypatch.setattr(links, "placed", placed)
-    group = Group(np.arange(linked), np.tile(np.eye(4), (linked, 1, 1)), np.ones(linked), np.zeros((0, 3)), np.zeros(0, int))
-    assert links.poses_from_links([None] * photos, [group], [], np.zeros((photos, 3)), 45.0, 1, 0, lambda *_: None) is None
+    group = Group(
+        np.arange(linked),
+        np.tile(np.eye(4), (linked, 1, 1)),
+        np.ones(linked),
+        np.zeros((0, 3)),
+        np.zeros(0, int),
+    )
+    assert (
+        links.poses_from_links(
+            [None] * photos, [group], [], np.zeros((photos, 3)), 45.0, 1, 0, lambda *_: None
+        )
+        is None
+    )
     assert bool(asked) == begins
 
 
 def spoilt(shots, which):
-    """The shots, the mask of one of them far too large: it takes what stands beside the object along."""
+    """The shots, the mask of one of them far too large: it takes what stands beside the object
+    along."""
     mask = shots[which].mask.copy()
     mask[:, :70] = 1
     out = list(shots)
@@ -178,16 +209,18 @@ def spoilt(shots, which):
 @pytest.mark.parametrize("bad", [None, 4])
 def test_one_bad_mask_does_not_unlink_few_photos(bad):
     from relit.cameras.links import Group
-    from relit.cameras.se3 import camera_errors
-    from relit.fit.collection_links import poses_from_links
-    from relit.fit.collection_photos import crops_of
+    from relit.fit.collection.links import poses_from_links
+    from relit.fit.collection.photos import crops_of
+    from relit.geometry.se3 import camera_errors
 
     shots, poses = shots_of(6, 6.0, 120, 0.45)
     shots = shots if bad is None else spoilt(shots, bad)
     other, _ = turned(poses, np.random.default_rng(3))
     group = Group(np.arange(6), other, np.full(6, 0.45), np.zeros((0, 3)), np.zeros(0, int))
     said = []
-    found, scores, held = poses_from_links(crops_of(shots), [group], shots, np.zeros((6, 3)), 45.0, 1, 0, said.append)
+    found, scores, held = poses_from_links(
+        crops_of(shots), [group], shots, np.zeros((6, 3)), 45.0, 1, 0, said.append
+    )
     assert held.all() and camera_errors(found, poses)[0].max() < 1
     named = [line for line in said if "look at its mask" in line]
     assert len(named) == (bad is not None)
@@ -196,17 +229,20 @@ def test_one_bad_mask_does_not_unlink_few_photos(bad):
 
 
 def test_given_cameras_begin_the_shape_like_matches(monkeypatch):
-    """They are not matched again, and bring every photo to its place; one photo without a camera, and matches are asked."""
-    from relit.cameras.se3 import camera_errors
-    from relit.fit import collection_links as links
-    from relit.fit.collection_photos import crops_of
+    """They are not matched again, and bring every photo to its place; one photo without a camera,
+    and matches are asked."""
+    from relit.fit.collection import links
+    from relit.fit.collection.photos import crops_of
+    from relit.geometry.se3 import camera_errors
 
     shots, poses = shots_of(8)
     other, _ = turned(poses, np.random.default_rng(5))
     given = [replace(s, given=p) for s, p in zip(shots, other, strict=True)]
     groups = links.links_stage(given, None, 0)
     assert len(groups) == 1 and np.allclose(groups[0].focals, 1.1)
-    found, scores, held = links.poses_from_links(crops_of(given), groups, given, np.zeros((8, 3)), 45.0, 1, 0, lambda *_: None)
+    found, scores, held = links.poses_from_links(
+        crops_of(given), groups, given, np.zeros((8, 3)), 45.0, 1, 0, lambda *_: None
+    )
     assert held.all() and camera_errors(found, poses)[0].max() < 1 and scores.mean() > 0.9
 
     class Asked(Exception):

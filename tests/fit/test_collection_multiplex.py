@@ -3,19 +3,29 @@
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
-from relit.fit.collection_multiplex import Multiplex, expanded, shares_of, updated, with_refined
-from relit.fit.register import Hypotheses
+from relit.fit.registration.photos.multiplex import (
+    Multiplex,
+    expanded,
+    shares_of,
+    updated,
+    with_refined,
+)
+from relit.fit.registration.register import Hypotheses
+from relit.geometry.se3 import exp_so3
 
 
 def turned(*degrees):
     """Poses turned about y by so many degrees."""
-    return np.array([similarity(exp_so3(np.array([0, np.radians(a), 0])), np.zeros(3)) for a in degrees])
+    return np.array(
+        [similarity(exp_so3(np.array([0, np.radians(a), 0])), np.zeros(3)) for a in degrees]
+    )
 
 
 def found(angles, scores):
-    return Hypotheses(turned(*angles)[None], np.array([scores], float), np.zeros((1, len(angles)), int))
+    return Hypotheses(
+        turned(*angles)[None], np.array([scores], float), np.zeros((1, len(angles)), int)
+    )
 
 
 def test_shares_follow_scores_and_sharpen():
@@ -28,7 +38,9 @@ def test_shares_follow_scores_and_sharpen():
 def test_memory_outlives_one_bad_round():
     state = updated(None, found([0, 90], [0.95, 0.85]), 0.5)
     held = state.memory[0, 0]
-    state = updated(state, found([92, 1], [0.93, 0.92]), 0.5)  # in another order, and the other one scores a little better
+    state = updated(
+        state, found([92, 1], [0.93, 0.92]), 0.5
+    )  # in another order, and the other one scores a little better
     assert state.memory[0, 1] > 0.6 and state.memory[0, 1] < held
     assert np.allclose(state.best, turned(1))
     for _ in range(8):
@@ -44,21 +56,32 @@ def test_a_new_hypothesis_starts_with_its_share():
 
 def test_what_takes_part():
     memory = np.array([[0.6, 0.4, 0.0], [0.95, 0.04, 0.01]])
-    state = Multiplex(np.stack([turned(0, 90, 180), turned(10, 100, 190)]), memory, np.zeros((2, 3)))
+    state = Multiplex(
+        np.stack([turned(0, 90, 180), turned(10, 100, 190)]), memory, np.zeros((2, 3))
+    )
     crops, poses, shares = expanded(["a", "b"], state)
-    assert crops == ["a", "a", "b"] and np.allclose(shares, [0.6, 0.4, 0.95]) and np.allclose(poses, turned(0, 90, 10))
+    assert (
+        crops == ["a", "a", "b"]
+        and np.allclose(shares, [0.6, 0.4, 0.95])
+        and np.allclose(poses, turned(0, 90, 10))
+    )
     refined = with_refined(state, np.stack([turned(84)[0], turned(12)[0]]))
-    assert np.allclose(refined.poses[0], turned(0, 84, 180)) and np.allclose(refined.poses[1], turned(12, 100, 190))
+    assert np.allclose(refined.poses[0], turned(0, 84, 180)) and np.allclose(
+        refined.poses[1], turned(12, 100, 190)
+    )
 
 
 def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_searched_for(monkeypatch):
     from types import SimpleNamespace
 
-    from relit.fit import collection, collection_held_out
-    from relit.fit.collection_options import CollectionOptions
+    from relit.fit.collection import held_out as collection_held_out
+    from relit.fit.collection import recipe as collection
+    from relit.fit.collection.options import CollectionOptions
 
     kept = []
-    camera = SimpleNamespace(with_pose=lambda pose: SimpleNamespace(world_from_camera=pose), world_from_camera=np.eye(4))
+    camera = SimpleNamespace(
+        with_pose=lambda pose: SimpleNamespace(world_from_camera=pose), world_from_camera=np.eye(4)
+    )
     shots = [SimpleNamespace(direction=np.zeros(3), camera=camera)]
     quiet = SimpleNamespace(say=lambda *_: None)
     nothing = {"crops_of": [None], "crop_rings": None, "volume_render": None, "make_gallery": None}
@@ -102,5 +125,7 @@ def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_search
         collection.find_all(shots, [], 45.0, quiet, options, 0)
         assert kept == [expected] * 4
         with pytest.raises(SearchedAgain):
-            collection_held_out.other_places(shots, [camera], None, 45.0, np.zeros(1, bool), options, 0)
+            collection_held_out.other_places(
+                shots, [camera], None, 45.0, np.zeros(1, bool), options, 0
+            )
         assert kept[4:] == [elsewhere]

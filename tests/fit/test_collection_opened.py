@@ -1,4 +1,5 @@
-"""A hollow that no silhouette shows, in photos under a light each: the shape of a collection is opened there, and nowhere else."""
+"""A hollow that no silhouette shows, in photos under a light each: the shape of a collection is
+opened there, and nowhere else."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -7,29 +8,41 @@ import numpy as np
 import pytest
 from hollow_box import BOX, FIRST_SMALL, ROOM, THEN_SMALL, N, cameras, pictures
 
-from relit.fit import collection_shape
-from relit.fit.collection_options import CollectionOptions
-from relit.fit.lids import open_lids
+from relit.fit.collection import shape as collection_shape
+from relit.fit.collection.options import CollectionOptions
+from relit.fit.shape.lids import open_lids
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import dense_values, resample
 from relit.run import Run
 
-OPTIONS = CollectionOptions(levels=(N, N + 8), level_steps=(60, 60), mask_weights=(0.8,), rays=2048, refine_cameras=0.0, hollows=2)
+OPTIONS = CollectionOptions(
+    levels=(N, N + 8),
+    level_steps=(60, 60),
+    mask_weights=(0.8,),
+    rays=2048,
+    refine_cameras=0.0,
+    hollows=2,
+)
 
 
 @pytest.fixture
 def small(monkeypatch):
     """Trials of a size for tests."""
     monkeypatch.setattr(collection_shape, "FIRST", FIRST_SMALL)
-    monkeypatch.setattr(collection_shape, "open_lids", partial(open_lids, first=FIRST_SMALL, then=THEN_SMALL))
+    monkeypatch.setattr(
+        collection_shape, "open_lids", partial(open_lids, first=FIRST_SMALL, then=THEN_SMALL)
+    )
 
 
 def shape_of(inside, folder, options=OPTIONS):
-    """(distances of the shape that comes out, its cameras) where the volume pass left the hull, which is the box."""
-    from relit.fit.pixels import make_bank
+    """(distances of the shape that comes out, its cameras) where the volume pass left the hull,
+    which is the box."""
+    from relit.fit.passes.pixels import make_bank
 
     rgb, alpha = pictures(inside)
-    lights = np.random.default_rng(0).uniform(0.5, 2, (len(rgb), 1, 1, 3)).astype(np.float32)  # exposure and white of each photo
+    lights = (
+        np.random.default_rng(0).uniform(0.5, 2, (len(rgb), 1, 1, 3)).astype(np.float32)
+    )  # exposure and white of each photo
     bank = make_bank(cameras(), list(rgb * lights), list(alpha))
     tints = 0.3 * lights[:, 0, 0]
     shots = [SimpleNamespace(mask=m) for m in alpha]

@@ -6,9 +6,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3, look_at
-from relit.fit.common_motion import without_common_motion
-from relit.fit.pixels import camera_rows, corrected
+from relit.fit.passes.camera_corrections import without_common_motion
+from relit.fit.passes.pixels import camera_rows, corrected
+from relit.geometry.se3 import exp_so3, look_at
 from relit.scene import Camera
 
 RNG = np.random.default_rng(3)
@@ -16,12 +16,15 @@ RNG = np.random.default_rng(3)
 
 def ring(count=7):
     eyes = RNG.normal(size=(count, 3))
-    eyes = 3 * eyes / np.linalg.norm(eyes, axis=1, keepdims=True) * RNG.uniform(0.8, 1.2, (count, 1))
+    eyes = (
+        3 * eyes / np.linalg.norm(eyes, axis=1, keepdims=True) * RNG.uniform(0.8, 1.2, (count, 1))
+    )
     return [Camera(64, 64, 80, 80, 32, 32, look_at(e, [0.1, 0, 0], [0, 0, 1])) for e in eyes]
 
 
 def between(cameras):
-    """Each camera as seen from the first one, distances in units of that to the second: what no common motion changes."""
+    """Each camera as seen from the first one, distances in units of that to the second: what no
+    common motion changes."""
     first = cameras[0].camera_from_world
     unit = np.linalg.norm(cameras[1].centre - cameras[0].centre)
     out = []
@@ -49,9 +52,18 @@ def common(cameras, each, turn, growth, shift):
 @pytest.mark.parametrize("each", [6, 7, 8])
 def test_a_common_motion_is_taken_out_whole(each):
     cameras = ring()
-    moved = common(cameras, each, np.array([2e-3, -1e-3, 3e-3]), 4e-3, np.array([5e-3, 1e-3, -2e-3]))
-    assert np.abs(np.diff(between(corrected(cameras, moved.ravel())) - between(cameras), axis=0)).max() < 1e-4  # the corrections are common
-    left = np.array(without_common_motion(mi.Float(moved.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))))
+    moved = common(
+        cameras, each, np.array([2e-3, -1e-3, 3e-3]), 4e-3, np.array([5e-3, 1e-3, -2e-3])
+    )
+    assert (
+        np.abs(np.diff(between(corrected(cameras, moved.ravel())) - between(cameras), axis=0)).max()
+        < 1e-4
+    )  # the corrections are common
+    left = np.array(
+        without_common_motion(
+            mi.Float(moved.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))
+        )
+    )
     assert np.abs(left).max() < 2e-2 * np.abs(moved).max()
 
 
@@ -60,14 +72,24 @@ def test_what_cameras_are_to_each_other_stays(each):
     cameras = ring()
     own = RNG.normal(size=(len(cameras), each)) * 5e-3
     before = own + common(cameras, each, np.array([4e-3, 0, -3e-3]), 6e-3, np.array([0, 8e-3, 0]))
-    after = np.array(without_common_motion(mi.Float(before.ravel().astype(np.float32)), mi.Float(camera_rows(cameras)))).reshape(-1, each)
+    after = np.array(
+        without_common_motion(
+            mi.Float(before.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))
+        )
+    ).reshape(-1, each)
     assert np.abs(after - before).max() > 3e-3
     a, b = (between(corrected(cameras, c.ravel())) for c in (after, before))
     np.testing.assert_allclose(a, b, atol=4e-4)
-    again = np.array(without_common_motion(mi.Float(after.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))))
+    again = np.array(
+        without_common_motion(
+            mi.Float(after.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))
+        )
+    )
     assert np.abs(again.reshape(-1, each) - after).max() < 2e-4  # nothing is left to take out
     if each > 6:
-        np.testing.assert_allclose(after[:, 6], before[:, 6], atol=1e-7)  # the focal lengths are the cameras' own
+        np.testing.assert_allclose(
+            after[:, 6], before[:, 6], atol=1e-7
+        )  # the focal lengths are the cameras' own
 
 
 def test_pictures_of_a_moved_scene_are_the_same():
@@ -80,4 +102,8 @@ def test_pictures_of_a_moved_scene_are_the_same():
         pose[:3, :3] = turn @ c.world_from_camera[:3, :3]
         pose[:3, 3] = grow * turn @ c.centre + shift
         moved = replace(c, world_from_camera=pose)
-        np.testing.assert_allclose([moved.project(p)[:2] for p in grow * x @ turn.T + shift], [c.project(p)[:2] for p in x], atol=1e-6)
+        np.testing.assert_allclose(
+            [moved.project(p)[:2] for p in grow * x @ turn.T + shift],
+            [c.project(p)[:2] for p in x],
+            atol=1e-6,
+        )

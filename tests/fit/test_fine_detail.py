@@ -1,4 +1,5 @@
-"""A ball that is alike from all sides but for what is painted on it, under lights of its own in every photo."""
+"""A ball that is alike from all sides but for what is painted on it, under lights of its own in
+every photo."""
 
 from types import SimpleNamespace
 
@@ -6,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from relit.cameras.se3 import look_at
 from relit.conventions import similarity
+from relit.geometry.se3 import look_at
 from relit.scene import Camera, Material, Mesh
 
 SIZE, SPP = 160, 32
@@ -16,9 +17,21 @@ SIZE, SPP = 160, 32
 def painted_ball(plain: bool) -> tuple[Mesh, Material]:
     ball = trimesh.creation.uv_sphere(0.6, count=[80, 80])
     n = np.asarray(ball.vertices, np.float64) / 0.6
-    uvs = np.stack([np.arctan2(n[:, 1], n[:, 0]) / (2 * np.pi) + 0.5, np.arccos(n[:, 2].clip(-1, 1)) / np.pi], -1)
-    mesh = Mesh(ball.vertices.astype(np.float32), np.asarray(ball.faces, np.int32), n.astype(np.float32), uvs.astype(np.float32))
-    base = np.full((36, 72, 3), 0.4, np.float32) if plain else np.random.default_rng(4).uniform(0.1, 0.8, (36, 72, 3)).astype(np.float32)
+    uvs = np.stack(
+        [np.arctan2(n[:, 1], n[:, 0]) / (2 * np.pi) + 0.5, np.arccos(n[:, 2].clip(-1, 1)) / np.pi],
+        -1,
+    )
+    mesh = Mesh(
+        ball.vertices.astype(np.float32),
+        np.asarray(ball.faces, np.int32),
+        n.astype(np.float32),
+        uvs.astype(np.float32),
+    )
+    base = (
+        np.full((36, 72, 3), 0.4, np.float32)
+        if plain
+        else np.random.default_rng(4).uniform(0.1, 0.8, (36, 72, 3)).astype(np.float32)
+    )
     return mesh, Material(base, np.full((2, 2), 0.6, np.float32), np.zeros((2, 2), np.float32))
 
 
@@ -31,8 +44,8 @@ def turned(camera: Camera, degrees: float) -> Camera:
 
 def photos(plain: bool):
     """(mesh, pictures, cameras) of twelve photos."""
-    from relit.fit.fine_detail import detail_of
-    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.fit.registration.fine_detail import detail_of
+    from relit.reference.mitsuba_scene import build_scene, render
 
     (mesh, material), rng, pictures, cameras = painted_ball(plain), np.random.default_rng(1), [], []
     for i in range(12):
@@ -54,7 +67,7 @@ def painted(device):
 
 
 def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
-    from relit.fit.fine_detail import surface_of, told_apart
+    from relit.fit.registration.fine_detail import surface_of, told_apart
 
     mesh, pictures, truth = painted
     cameras = [turned(c, 180) if i in (3, 7) else c for i, c in enumerate(truth)]
@@ -67,7 +80,7 @@ def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
 
 
 def test_a_new_photo_is_held_against_the_others(painted):
-    from relit.fit.fine_detail import laid_on, surface_of, told_apart
+    from relit.fit.registration.fine_detail import laid_on, surface_of, told_apart
 
     mesh, pictures, truth = painted
     surface = surface_of(mesh)
@@ -79,7 +92,7 @@ def test_a_new_photo_is_held_against_the_others(painted):
 
 
 def test_a_plain_ball_tells_nothing(device):
-    from relit.fit.fine_detail import surface_of, told_apart
+    from relit.fit.registration.fine_detail import surface_of, told_apart
 
     mesh, pictures, cameras = photos(plain=True)
     choices = [(i, turned(c, t)) for i, c in enumerate(cameras) for t in (90, 180, 270)]
@@ -88,13 +101,15 @@ def test_a_plain_ball_tells_nothing(device):
 
 
 def test_likeness_of_poses(painted):
-    from relit.fit.fine_detail import expected, laid_on, likeness, surface_of
+    from relit.fit.registration.fine_detail import expected, laid_on, likeness, surface_of
 
     mesh, pictures, cameras = painted
     surface = surface_of(mesh)
     laid = np.array([laid_on(surface, c, p) for c, p in zip(cameras, pictures, strict=True)])
     side = (np.asarray(mesh.vertices) @ cameras[0].centre) > 0
-    assert np.isfinite(laid[0]).sum() > 100 and not np.isfinite(laid[0][~side]).any()  # it sees its own side alone
+    assert (
+        np.isfinite(laid[0]).sum() > 100 and not np.isfinite(laid[0][~side]).any()
+    )  # it sees its own side alone
     shown = expected(laid[1:])
     right = likeness(surface, cameras[0], pictures[0], shown)
     assert right > 0.5
@@ -107,7 +122,7 @@ def test_likeness_of_poses(painted):
 
 
 def test_photos_in_wrong_places_are_not_borne_out(painted):
-    from relit.fit.fine_detail import borne_out, surface_of
+    from relit.fit.registration.fine_detail import borne_out, surface_of
 
     mesh, pictures, truth = painted
     surface = surface_of(mesh)
@@ -121,20 +136,34 @@ def test_photos_in_wrong_places_are_not_borne_out(painted):
 
 
 def test_what_is_said_of_photos_that_are_not_borne_out():
-    from relit.fit.collection import say_borne_out
+    from relit.fit.collection.recipe import say_borne_out
 
     def said(detail, as_well=()):
         lines, turns = [], np.zeros(len(detail))
         turns[list(as_well)] = 90.0
-        say_borne_out(np.array(detail), turns, [f"{i}.jpg" for i in range(len(detail))], SimpleNamespace(say=lines.append))
+        say_borne_out(
+            np.array(detail),
+            turns,
+            [f"{i}.jpg" for i in range(len(detail))],
+            SimpleNamespace(say=lines.append),
+        )
         return lines
 
     assert len(said([0.5, 0.6, 0.4])) == 1
     assert "1.jpg" in said([0.5, 0.1, 0.4])[1] and "0.jpg" not in said([0.5, 0.1, 0.4])[1]
     assert "most photos" in said([0.5, 0.1, -1.0])[1] and len(said([0.5, 0.1, -1.0], [1, 2])) == 2
     assert "3.jpg" in said([0.5] * 9, [3])[1] and "alike" not in said([0.5] * 9, [3])[1]
-    assert "alike from several sides" in said([0.5] * 9, [0, 3])[1] and "90 degrees" in said([0.5] * 9, [0, 3])[1]
+    assert (
+        "alike from several sides" in said([0.5] * 9, [0, 3])[1]
+        and "90 degrees" in said([0.5] * 9, [0, 3])[1]
+    )
     # whose own place is not borne out says nothing of the object
-    assert len(said([0.5] * 6 + [0.1] * 4, [6, 7, 8, 9])) == 2 and "9.jpg" in said([0.5] * 6 + [0.1] * 4, [6, 7, 8, 9])[1]
-    assert "1 of 6 photos fit" in said([0.5] * 6 + [0.1] * 4, [0, 6, 7])[2] and "alike" in said([0.5] * 6 + [0.1] * 4, [0])[2]
+    assert (
+        len(said([0.5] * 6 + [0.1] * 4, [6, 7, 8, 9])) == 2
+        and "9.jpg" in said([0.5] * 6 + [0.1] * 4, [6, 7, 8, 9])[1]
+    )
+    assert (
+        "1 of 6 photos fit" in said([0.5] * 6 + [0.1] * 4, [0, 6, 7])[2]
+        and "alike" in said([0.5] * 6 + [0.1] * 4, [0])[2]
+    )
     assert said([0.5] * 12 + [0.1] * 11)[1].endswith("21.jpg ...")

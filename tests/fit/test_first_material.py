@@ -5,51 +5,79 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relit.capture import open_capture
-from relit.fit import first_material as first
-from relit.fit.multiview import MultiviewOptions, reconstruct
-from relit.fit.surface import SurfaceOptions
+from relit.capture.open import open_capture
+from relit.fit.multiview.recipe import MultiviewOptions, reconstruct
+from relit.fit.passes import first_material as first
+from relit.fit.passes.surface import SurfaceOptions
 from relit.run import Run
 
 SMALL = MultiviewOptions(
-    hollows=0, levels=(24, 40), level_steps=(60, 60), rays=2048, faces=2000, texture=64, surface_steps=600, points=1024, light=16
+    hollows=0,
+    levels=(24, 40),
+    level_steps=(60, 60),
+    rays=2048,
+    faces=2000,
+    texture=64,
+    surface_steps=600,
+    points=1024,
+    light=16,
 )
 SIZE = 64
 
 
 def photographed_ball(out, metallic, roughness):
-    """Twenty 64x64 photos of a ball, gold above the equator and red below; metallic, roughness: (above, below)."""
+    """Twenty 64x64 photos of a ball, gold above the equator and red below; metallic, roughness:
+    (above, below)."""
     import json
 
     import trimesh
 
-    from relit.cameras.se3 import look_at
     from relit.conventions import world_from_gl_camera
+    from relit.geometry.se3 import look_at
     from relit.images import write_linear
-    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.reference.mitsuba_scene import build_scene, render
     from relit.scene import Camera, Material, Mesh
 
     ball = trimesh.creation.uv_sphere(0.5, count=[32, 32])
     v = np.asarray(ball.vertices, np.float32)
     n = v / np.linalg.norm(v, axis=1, keepdims=True)
-    uvs = np.stack([np.arctan2(n[:, 1], n[:, 0]) / (2 * np.pi) + 0.5, np.arccos(n[:, 2].clip(-1, 1)) / np.pi], -1).astype(np.float32)
+    uvs = np.stack(
+        [np.arctan2(n[:, 1], n[:, 0]) / (2 * np.pi) + 0.5, np.arccos(n[:, 2].clip(-1, 1)) / np.pi],
+        -1,
+    ).astype(np.float32)
     base = np.full((16, 16, 3), (0.8, 0.6, 0.2), np.float32)
     base[8:] = (0.6, 0.1, 0.1)
-    sides = [np.repeat(np.array(a, np.float32), 8)[:, None] * np.ones(16, np.float32) for a in (roughness, metallic)]
+    sides = [
+        np.repeat(np.array(a, np.float32), 8)[:, None] * np.ones(16, np.float32)
+        for a in (roughness, metallic)
+    ]
     light = np.full((16, 32, 3), 0.2, np.float32)
     light[2:5, 4:8], light[6:8, 14:16], light[5:9, 24:26] = (9.0, 8.5, 8.0), 12.0, (4.0, 5.0, 6.0)
     material = Material(base, *sides)
-    scene = build_scene(Mesh(v, np.asarray(ball.faces, np.int32), n, uvs), material, np.eye(4), light)
+    scene = build_scene(
+        Mesh(v, np.asarray(ball.faces, np.int32), n, uvs), material, np.eye(4), light
+    )
     (out / "train").mkdir(parents=True)
     frames, focal = [], 0.5 * SIZE / np.tan(np.radians(20))
     for i in range(20):
         z = 1 - 2 * (i + 0.5) / 20
-        eye = 2.0 * np.array([np.sqrt(1 - z * z) * np.cos(2.4 * i), np.sqrt(1 - z * z) * np.sin(2.4 * i), z])
+        eye = 2.0 * np.array(
+            [np.sqrt(1 - z * z) * np.cos(2.4 * i), np.sqrt(1 - z * z) * np.sin(2.4 * i), z]
+        )
         pose = look_at(eye, np.zeros(3), np.array([0, 0, 1.0]))
-        picture = render(scene, Camera(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2, pose), spp=64, seed=i)
+        picture = render(
+            scene, Camera(SIZE, SIZE, focal, focal, SIZE / 2, SIZE / 2, pose), spp=64, seed=i
+        )
         write_linear(out / "train" / f"r_{i}.exr", picture)
-        frames.append({"file_path": f"train/r_{i}.exr", "transform_matrix": world_from_gl_camera(pose).tolist()})
-    (out / "transforms_train.json").write_text(json.dumps({"camera_angle_x": float(np.radians(40)), "frames": frames}))
+        frames.append(
+            {
+                "file_path": f"train/r_{i}.exr",
+                "transform_matrix": world_from_gl_camera(pose).tolist(),
+            }
+        )
+    (out / "transforms_train.json").write_text(
+        json.dumps({"camera_angle_x": float(np.radians(40)), "frames": frames})
+    )
     return out
 
 
@@ -58,7 +86,9 @@ def found(tmp_path, metallic, roughness=(0.3, 0.3), **options):
     capture = open_capture(photographed_ball(tmp_path / "ball", metallic, roughness))
     with Run.open(tmp_path / "run", {}) as run:
         asset = reconstruct(capture, run, replace(SMALL, **options), 0)
-    z = (asset.mesh.vertices @ asset.world_from_asset[:3, :3].T)[:, 2] / np.cbrt(np.linalg.det(asset.world_from_asset[:3, :3]))
+    z = (asset.mesh.vertices @ asset.world_from_asset[:3, :3].T)[:, 2] / np.cbrt(
+        np.linalg.det(asset.world_from_asset[:3, :3])
+    )
     uv = np.clip((asset.mesh.uvs * 64).astype(int), 0, 63)
     maps = [m[uv[:, 1], uv[:, 0]] for m in (asset.material.metallic, asset.material.roughness)]
     return [(m[z > 0.1].mean(), m[z < -0.1].mean()) for m in maps]
@@ -120,10 +150,14 @@ def test_paint_that_gains_by_the_light_of_a_metal_beside_it_stays_paint():
 
 @pytest.mark.parametrize("other, taken", [(0.8, True), (1.0, False), (1.2, False)])
 def test_paint_that_hardly_gains_follows_the_rest_of_the_paint(other, taken):
-    """The first group gains 2 % as dull paint, which short fits leave uncertain; the second, twice as large, decides, not the metal."""
+    """The first group gains 2 % as dull paint, which short fits leave uncertain; the second, twice
+    as large, decides, not the metal."""
     pixels = np.array([100, 200, 100])
     as_paint, as_metal, as_dull = ([1.0, 1, 5], [1.1, 1.1, 1], [0.98, other, 4])
-    fits = [np.stack([100 * np.array(e) * [1, 2, 1], [10, 20, 90], pixels], 1) for e in (as_paint, as_metal, as_dull)]
+    fits = [
+        np.stack([100 * np.array(e) * [1, 2, 1], [10, 20, 90], pixels], 1)
+        for e in (as_paint, as_metal, as_dull)
+    ]
     is_metal, is_dull = first.explained_better(*fits)
     assert list(is_metal) == [False, False, True]
     assert list(is_dull) == [taken, other == 0.8, False]
@@ -131,19 +165,35 @@ def test_paint_that_hardly_gains_follows_the_rest_of_the_paint(other, taken):
 
 def test_a_dull_start_is_taken_where_the_short_fit_is_better(tmp_path, monkeypatch):
     """What the decision says reaches the pass: everything that is called dull begins so."""
-    monkeypatch.setattr(first, "explained_better", lambda paint, metal, dull: (paint[:, 0] < 0, paint[:, 0] >= 0))
+    monkeypatch.setattr(
+        first, "explained_better", lambda paint, metal, dull: (paint[:, 0] < 0, paint[:, 0] >= 0)
+    )
     _, begun = found(tmp_path, (0.0, 0.0), surface_steps=2)
     assert min(begun) > 0.55, begun
 
 
-@pytest.mark.parametrize("metallic, dullness, fits", [(0.1, False, 2), (0.1, True, 3), (0.9, False, 3)])
-def test_the_fit_that_tells_dull_paint_is_spared_where_nothing_asks_for_it(monkeypatch, metallic, dullness, fits):
+@pytest.mark.parametrize(
+    "metallic, dullness, fits", [(0.1, False, 2), (0.1, True, 3), (0.9, False, 3)]
+)
+def test_the_fit_that_tells_dull_paint_is_spared_where_nothing_asks_for_it(
+    monkeypatch, metallic, dullness, fits
+):
     """It is made where dullness is asked for, and where it may stand against metal."""
     begun = []
     monkeypatch.setattr(first, "start_surface", lambda *a: begun.append(a[3].roughness_start))
     monkeypatch.setattr(first, "fit_surface", lambda *a: None)
-    monkeypatch.setattr(first, "errors", lambda *a: np.array([[1.0 - 0.4 * (len(begun) == 2) * (metallic > 0.5), 10 * metallic, 10]]))
+    monkeypatch.setattr(
+        first,
+        "errors",
+        lambda *a: np.array(
+            [[1.0 - 0.4 * (len(begun) == 2) * (metallic > 0.5), 10 * metallic, 10]]
+        ),
+    )
     base, known = np.full((8, 8, 3), 0.5, np.float32), np.ones((8, 8), bool)
-    start, roughness = first.first_material(None, None, base, known, 1.0, None, SurfaceOptions(), dullness=dullness)
+    start, roughness = first.first_material(
+        None, None, base, known, 1.0, None, SurfaceOptions(), dullness=dullness
+    )
     assert len(begun) == fits
-    assert (start == (first.METAL if metallic > 0.5 else first.PAINT)).all() and (roughness == SurfaceOptions().roughness_start).all()
+    assert (start == (first.METAL if metallic > 0.5 else first.PAINT)).all() and (
+        roughness == SurfaceOptions().roughness_start
+    ).all()

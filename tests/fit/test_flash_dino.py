@@ -1,4 +1,5 @@
-"""Features of a network on the surface: an ONNX file of the right signature, made here byte by byte, and how its tokens reach places."""
+"""Features of a network on the surface: an ONNX file of the right signature, made here byte by
+byte, and how its tokens reach places."""
 
 import numpy as np
 import pytest
@@ -7,7 +8,16 @@ from tiny_onnx import field, tensor
 from relit.capture.networks import MEAN, SPREAD
 from relit.conventions import srgb_from_linear
 from relit.errors import UserError
-from relit.fit.flash_dino import KEPT, SCALE, DinoNetwork, dino_features, network_file, principal, sampled, token_map
+from relit.fit.flash.dino import (
+    KEPT,
+    SCALE,
+    DinoNetwork,
+    dino_features,
+    network_file,
+    principal,
+    sampled,
+    token_map,
+)
 from relit.scene import Camera
 
 PATCH, CHANNELS = 8, 5
@@ -18,7 +28,13 @@ def integers(name: str, values) -> bytes:
 
 
 def node(kind: str, inputs, output: str, *attributes: bytes) -> bytes:
-    return field(1, b"".join(field(1, i) for i in inputs) + field(2, output) + field(4, kind) + b"".join(attributes))
+    return field(
+        1,
+        b"".join(field(1, i) for i in inputs)
+        + field(2, output)
+        + field(4, kind)
+        + b"".join(attributes),
+    )
 
 
 def value(name: str, *sides) -> bytes:
@@ -27,10 +43,23 @@ def value(name: str, *sides) -> bytes:
 
 
 def write_network(path, weight: np.ndarray) -> None:
-    """Patches of the picture times `weight` (CHANNELS, 3, PATCH, PATCH), as tokens (1, P, CHANNELS)."""
-    graph = node("Conv", ["x", "w"], "c", integers("kernel_shape", [PATCH, PATCH]), integers("strides", [PATCH, PATCH]))
-    graph += node("Reshape", ["c", "shape"], "r") + node("Transpose", ["r"], "y", integers("perm", [0, 2, 1])) + field(2, "patches")
-    graph += field(5, tensor("w", weight.astype("<f4"))) + field(5, tensor("shape", np.array([1, CHANNELS, -1], "<i8"), 7))
+    """Patches of the picture times `weight` (CHANNELS, 3, PATCH, PATCH), as tokens (1, P,
+    CHANNELS)."""
+    graph = node(
+        "Conv",
+        ["x", "w"],
+        "c",
+        integers("kernel_shape", [PATCH, PATCH]),
+        integers("strides", [PATCH, PATCH]),
+    )
+    graph += (
+        node("Reshape", ["c", "shape"], "r")
+        + node("Transpose", ["r"], "y", integers("perm", [0, 2, 1]))
+        + field(2, "patches")
+    )
+    graph += field(5, tensor("w", weight.astype("<f4"))) + field(
+        5, tensor("shape", np.array([1, CHANNELS, -1], "<i8"), 7)
+    )
     graph += field(11, value("x", 1, 3, "h", "w")) + field(12, value("y", 1, "p", CHANNELS))
     path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13)))
 
@@ -64,24 +93,31 @@ def test_rows_and_columns_stand_where_they_are(network):
 
 
 def test_like_places_get_like_features(network):
-    """Two paints on a plane that three cameras look at: the features tell the paints apart, and views agree."""
+    """Two paints on a plane that three cameras look at: the features tell the paints apart, and
+    views agree."""
     photo = np.zeros((56, 56, 3))
     photo[:, :28], photo[:, 28:] = [0.5, 0.1, 0.1], [0.1, 0.3, 0.6]
     cameras = [Camera(56, 56, 60, 60, 28, 28, np.eye(4))] * 3
     rng = np.random.default_rng(0)
     column, row = rng.uniform(2, 54, (2, 300))
     weight = np.where(np.arange(300) < 290, 1.0, 0.0)
-    features, seen = dino_features(network, lambda view: photo, cameras, lambda view: (column, row, weight), 300)
+    features, seen = dino_features(
+        network, lambda view: photo, cameras, lambda view: (column, row, weight), 300
+    )
     assert features.shape == (300, KEPT) and seen[:290].all() and not seen[290:].any()
     left, right = (features[:290][side[:290]] for side in (column < 22, column > 34))
-    assert np.linalg.norm(left.mean(0) - right.mean(0)) > 10 * max(left.std(0).max(), right.std(0).max())
+    assert np.linalg.norm(left.mean(0) - right.mean(0)) > 10 * max(
+        left.std(0).max(), right.std(0).max()
+    )
     assert np.all(features[290:] == 0)
 
 
 def test_look_up_is_bilinear():
     picture = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), -1)  # x and y
     x, y = np.array([0.25, 3.5, -2.0, 9.0]), np.array([1.5, 2.75, 0.0, 9.0])
-    np.testing.assert_allclose(sampled(picture, x, y), np.stack([np.clip(x, 0, 4), np.clip(y, 0, 3)], -1))
+    np.testing.assert_allclose(
+        sampled(picture, x, y), np.stack([np.clip(x, 0, 4), np.clip(y, 0, 3)], -1)
+    )
 
 
 def test_principal_components_keep_distances():
@@ -90,7 +126,9 @@ def test_principal_components_keep_distances():
     flat = rng.normal(size=(200, 2)) * [3.0, 1.0]
     got = principal(flat @ basis.T, np.ones(200, bool))
     assert got[:, 0].std() == pytest.approx(SCALE, rel=1e-4)
-    ratio = np.linalg.norm(got[:100] - got[100:], axis=1) / np.linalg.norm(flat[:100] - flat[100:], axis=1)
+    ratio = np.linalg.norm(got[:100] - got[100:], axis=1) / np.linalg.norm(
+        flat[:100] - flat[100:], axis=1
+    )
     assert np.ptp(ratio) < 1e-4 * ratio.mean()
 
 

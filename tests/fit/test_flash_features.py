@@ -1,4 +1,5 @@
-"""What a flash capture tells of each place before any fit, on a ball whose albedo is known; and a network's features on the same places."""
+"""What a flash capture tells of each place before any fit, on a ball whose albedo is known; and a
+network's features on the same places."""
 
 import flash_ball as scene
 import mitsuba as mi
@@ -6,9 +7,16 @@ import numpy as np
 import pytest
 from test_flash_dino import write_network
 
-from relit.fit.flash_dino import DinoNetwork
-from relit.fit.flash_features import FlashView, capture_features, network_features, seen_from
-from relit.fit.kinship import LADDER, SCALES, best_lobes, highlights_seen, pooled, start_kinship
+from relit.fit.flash.dino import DinoNetwork
+from relit.fit.flash.features import FlashView, capture_features, network_features, seen_from
+from relit.fit.flash.lobe_clusters import (
+    LADDER,
+    SCALES,
+    best_lobes,
+    highlights_seen,
+    pooled,
+    start_kinship,
+)
 from relit.materials.plastic_field import plastic_at
 from relit.materials.rough_plastic import Coat
 
@@ -70,14 +78,20 @@ def test_features_of_a_network_tell_the_paints_apart(shot, places, tmp_path):
 
 
 def test_like_groups_count_each_other_s_evidence():
-    """Two groups of one paint, one of another: a group without evidence takes the lobe of the like one."""
+    """Two groups of one paint, one of another: a group without evidence takes the lobe of the like
+    one."""
     rng = np.random.default_rng(0)
     paint = np.repeat([0.2, 0.2, 0.8], 100)
-    features = np.stack([paint, np.repeat([0, 0.02, 0.5], 100)], -1).reshape(1, 300, 2) + rng.normal(0, 1e-4, (1, 300, 2))
+    features = np.stack([paint, np.repeat([0, 0.02, 0.5], 100)], -1).reshape(
+        1, 300, 2
+    ) + rng.normal(0, 1e-4, (1, 300, 2))
     kin = start_kinship(features, np.ones((1, 300), bool), np.full((1, 300, 2), 0.3), groups=4)
     centres = np.array(kin.index).reshape(300, 4)[:, 0]
     first, last = centres[0], centres[-1]
-    assert kin.apart[first, centres[150]] < min(SCALES[:3]) ** 2 and kin.apart[first, last] > (3 * max(SCALES)) ** 2
+    assert (
+        kin.apart[first, centres[150]] < min(SCALES[:3]) ** 2
+        and kin.apart[first, last] > (3 * max(SCALES)) ** 2
+    )
     np.testing.assert_allclose(np.array(kin.weight).reshape(300, 4).sum(1), 1, rtol=1e-5)
 
 
@@ -98,9 +112,12 @@ def test_the_best_lobe_is_that_of_the_photo():
 
 
 def test_a_group_that_shows_no_highlight_takes_the_lobe_of_the_likest():
-    """Two paints seen from all sides, and the underside of the first, seen at grazing angles alone and with a falloff that is wrong."""
+    """Two paints seen from all sides, and the underside of the first, seen at grazing angles alone
+    and with a falloff that is wrong."""
     rng = np.random.default_rng(4)
-    features = np.repeat([[0.2, 0.0], [0.8, 0.0], [0.2, 0.12]], 100, axis=0).reshape(1, 300, 2) + rng.normal(0, 1e-4, (1, 300, 2))
+    features = np.repeat([[0.2, 0.0], [0.8, 0.0], [0.2, 0.12]], 100, axis=0).reshape(
+        1, 300, 2
+    ) + rng.normal(0, 1e-4, (1, 300, 2))
     kin = start_kinship(features, np.ones((1, 300), bool), np.full((1, 300, 2), 0.3), groups=4)
     nearest = np.array(kin.index).reshape(300, 4)[:, 0]
     lobe = lambda a, t: np.exp(-((np.tan(t) / a) ** 2)) / a**2 * 0.01  # noqa: E731
@@ -120,7 +137,9 @@ def test_a_group_that_shows_no_highlight_takes_the_lobe_of_the_likest():
     assert kin.trust[top] == 1 and kin.trust[other] == 1 and kin.trust[under] == 0
     start = np.tile([0.5, 0.3], (4, 1))
     found = best_lobes(pooled(kin), start)
-    assert found[top, 1] == pytest.approx(0.2, rel=0.1) and found[other, 1] == pytest.approx(0.4, rel=0.1)
+    assert found[top, 1] == pytest.approx(0.2, rel=0.1) and found[other, 1] == pytest.approx(
+        0.4, rel=0.1
+    )
     np.testing.assert_allclose(found[under, :2], found[top, :2], rtol=0.02)
     alone = best_lobes(kin.sums, start)  # what it would take from itself
     assert alone[under, 1] > 0.5

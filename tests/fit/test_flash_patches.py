@@ -6,17 +6,24 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.flash_patches import C1, C2, DARK, SIDE, draw_patches, pyramid_loss, ssim_loss
-from relit.fit.pixels import make_bank
+from relit.fit.flash.patches import C1, C2, DARK, SIDE, draw_patches, pyramid_loss, ssim_loss
+from relit.fit.passes.pixels import make_bank
 
 N = SIDE**2
-CURVE = np.array([[(k >> 0 & 1) | (k >> 1 & 2) | (k >> 2 & 4), (k >> 1 & 1) | (k >> 2 & 2) | (k >> 3 & 4)] for k in range(N)])  # x, y
+CURVE = np.array(
+    [
+        [(k >> 0 & 1) | (k >> 1 & 2) | (k >> 2 & 4), (k >> 1 & 1) | (k >> 2 & 2) | (k >> 3 & 4)]
+        for k in range(N)
+    ]
+)  # x, y
 
 
 @pytest.fixture(scope="module")
 def bank(device):
     views = scene.cameras(3, 20)
-    return make_bank(views, [np.zeros((20, 20, 3), np.float32)] * 3, [np.ones((20, 20), np.float32)] * 3)
+    return make_bank(
+        views, [np.zeros((20, 20, 3), np.float32)] * 3, [np.ones((20, 20), np.float32)] * 3
+    )
 
 
 def test_patches_are_squares_inside_one_photo(bank):
@@ -36,7 +43,11 @@ def patches(seed, count=5):
     """a, b, target (count, N, 3)."""
     rng = np.random.default_rng(seed)
     target = rng.uniform(0.02, 0.9, (count, N, 3))
-    return target * rng.uniform(0.8, 1.3, target.shape), target * rng.uniform(0.8, 1.3, target.shape), target
+    return (
+        target * rng.uniform(0.8, 1.3, target.shape),
+        target * rng.uniform(0.8, 1.3, target.shape),
+        target,
+    )
 
 
 def colour(v):
@@ -50,7 +61,10 @@ def test_pyramid_against_numpy(device):
     expected = 0.0
     for side in (2, 4, 8):
         block = CURVE[:, 1] // side * SIDE + CURVE[:, 0] // side
-        pooled = [np.stack([((h - t) * scale)[:, block == k].mean(1) for k in np.unique(block)]) for h in (a, b)]
+        pooled = [
+            np.stack([((h - t) * scale)[:, block == k].mean(1) for k in np.unique(block)])
+            for h in (a, b)
+        ]
         expected += (pooled[0] * pooled[1]).mean()
     got = pyramid_loss(colour(a), colour(b), colour(t), mi.Float(weight.ravel().astype(np.float32)))
     assert float(got[0]) == pytest.approx(expected, rel=1e-4)
@@ -64,7 +78,11 @@ def test_ssim_against_numpy(device):
     m, mt = (p.mean(1) + q.mean(1)) / 2, s.mean(1)
     variance = np.maximum((p * q).mean(1) - p.mean(1) * q.mean(1), 0)
     covariance = ((p + q) / 2 * s).mean(1) - m * mt
-    ssim = (2 * m * mt + C1) * (2 * covariance + C2) / ((m**2 + mt**2 + C1) * (variance + s.var(1) + C2))
+    ssim = (
+        (2 * m * mt + C1)
+        * (2 * covariance + C2)
+        / ((m**2 + mt**2 + C1) * (variance + s.var(1) + C2))
+    )
     expected = (1 - ssim[[0, 2, 3, 4]]).mean() / 2
     got = ssim_loss(colour(a), colour(b), colour(t), mi.Bool(valid.ravel()))
     assert float(got[0]) == pytest.approx(expected, rel=1e-3)
@@ -76,7 +94,10 @@ def test_both_vanish_at_the_photo_and_have_gradients(device):
     assert float(pyramid_loss(colour(t), colour(t), colour(t), one)[0]) == 0
     assert abs(float(ssim_loss(colour(t), colour(t), colour(t), one > 0)[0])) < 1e-3
     direction = np.random.default_rng(5).uniform(0.5, 1, a.shape) * np.sign(a - t)
-    for loss in (lambda c: pyramid_loss(c, c, colour(t), one), lambda c: ssim_loss(c, c, colour(t), one > 0)):
+    for loss in (
+        lambda c: pyramid_loss(c, c, colour(t), one),
+        lambda c: ssim_loss(c, c, colour(t), one > 0),
+    ):
         c = colour(a)
         dr.enable_grad(c)
         dr.backward(loss(c))

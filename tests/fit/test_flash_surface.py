@@ -1,4 +1,5 @@
-"""The surface pass under a flash: gradients against finite differences, and what it finds on a ball whose photos it could have made."""
+"""The surface pass under a flash: gradients against finite differences, and what it finds on a ball
+whose photos it could have made."""
 
 import drjit as dr
 import flash_ball as scene
@@ -6,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.flash_surface import (
+from relit.fit.flash.lobe_clusters import best_lobes, start_kinship
+from relit.fit.flash.surface import (
     FlashModel,
     FlashSurfaceOptions,
     brightness,
@@ -17,9 +19,8 @@ from relit.fit.flash_surface import (
     rescale,
     robust_weight,
 )
-from relit.fit.kinship import best_lobes, start_kinship
-from relit.fit.loop import NoStage
-from relit.fit.pixels import batch_of
+from relit.fit.passes.optimiser import NoStage
+from relit.fit.passes.pixels import batch_of
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import PlasticField, plastic_at, plastic_pictures, start_plastic
 from relit.materials.rough_plastic import Coat
@@ -36,7 +37,8 @@ PARAMETERS = ("offset", "log_intensity", "diffuse", "specular", "alpha", "slope"
 
 
 def loss_of(shot, offset, log_intensity, field, bounces=0):
-    """A smooth function of everything that the pass moves, over some pixels, the visibility left out."""
+    """A smooth function of everything that the pass moves, over some pixels, the visibility left
+    out."""
     bank, _, mesh, _ = shot
     pixel = dr.arange(mi.UInt32, 0, bank.total, 7)
     batch = batch_of(bank, pixel)
@@ -59,11 +61,15 @@ def test_gradients(shot, name):
         "log_intensity": mi.Float([1.5]),
         "diffuse": mi.Float(field.diffuse),
         "lobe": mi.Float(field.lobe),
-        "slope": mi.Float(np.random.default_rng(1).normal(0, 0.05, dr.width(field.slope)).astype(np.float32)),
+        "slope": mi.Float(
+            np.random.default_rng(1).normal(0, 0.05, dr.width(field.slope)).astype(np.float32)
+        ),
     }
     array = "lobe" if name in ("specular", "alpha") else name
     rng = np.random.default_rng(2)
-    direction = np.abs(rng.normal(size=dr.width(values[array])))  # one sign: the sum does not cancel down to rounding errors
+    direction = np.abs(
+        rng.normal(size=dr.width(values[array]))
+    )  # one sign: the sum does not cancel down to rounding errors
     if array == "lobe":
         direction[(np.arange(len(direction)) % 2) != (name == "alpha")] = 0
 
@@ -90,11 +96,25 @@ def fitted(shot, kin=True, **options):
     true = plastic_pictures(truth)
     flat = np.full((size, size), 0.5, np.float32)
     start = start_plastic(0.9 * true["diffuse"], flat, 0.2 * flat / 0.5)
-    features = np.concatenate([np.sqrt(true["diffuse"]), np.zeros((size, size, 1))], -1).astype(np.float32)
+    features = np.concatenate([np.sqrt(true["diffuse"]), np.zeros((size, size, 1))], -1).astype(
+        np.float32
+    )
     kinship = None
     if kin:
-        kinship = start_kinship(features[..., :3], np.ones((size, size), bool), np.stack([flat, 0.4 * flat], -1), groups=6)
-    model = FlashModel(start, mi.Float(features.ravel()), kinship, dr.zeros(mi.Float, 3), mi.Float([np.log(scene.INTENSITY)]), Coat())
+        kinship = start_kinship(
+            features[..., :3],
+            np.ones((size, size), bool),
+            np.stack([flat, 0.4 * flat], -1),
+            groups=6,
+        )
+    model = FlashModel(
+        start,
+        mi.Float(features.ravel()),
+        kinship,
+        dr.zeros(mi.Float, 3),
+        mi.Float([np.log(scene.INTENSITY)]),
+        Coat(),
+    )
     settings = {"steps": 200, "points": 2048, "directions": 0, "offset_rate": 0.006, **options}
     fit_flash_surface(bank, views, mesh, model, FlashSurfaceOptions(**settings), NoStage())
     return model
@@ -116,13 +136,19 @@ def test_lobes_are_found_for_both_paints(shot, found):
     rows = slice(8, -12)  # the cameras look from above
     bright = true["diffuse"][rows, :, 0] > 0.3
     for paint in (bright, ~bright):
-        assert np.median(got["alpha"][rows][paint]) == pytest.approx(np.median(true["alpha"][rows][paint]), rel=0.15)
-        assert np.median(got["specular"][rows][paint]) == pytest.approx(np.median(true["specular"][rows][paint]), rel=0.2)
+        assert np.median(got["alpha"][rows][paint]) == pytest.approx(
+            np.median(true["alpha"][rows][paint]), rel=0.15
+        )
+        assert np.median(got["specular"][rows][paint]) == pytest.approx(
+            np.median(true["specular"][rows][paint]), rel=0.2
+        )
 
 
 def test_patches_lead_to_the_offset_too(shot):
     model = fitted(shot, patches=0.3, steps=60, kin=False)
-    assert np.linalg.norm(np.array(model.offset)[:2] - scene.OFFSET[:2]) < 0.6 * np.linalg.norm(scene.OFFSET[:2])
+    assert np.linalg.norm(np.array(model.offset)[:2] - scene.OFFSET[:2]) < 0.6 * np.linalg.norm(
+        scene.OFFSET[:2]
+    )
 
 
 def test_fixed_offset_stays(shot):
@@ -138,7 +164,10 @@ def test_shadow_is_cast_by_the_ball_itself(shot):
     behind = lit(mesh, points, mi.Vector3f(0, -3, 0), points.valid)
     facing = np.array(points.geometric.y) < -0.3
     hit = np.array(points.valid)
-    assert np.array(behind)[hit & facing].mean() > 0.99 and np.array(behind)[hit & (np.array(points.geometric.y) > 0.1)].max() == 0
+    assert (
+        np.array(behind)[hit & facing].mean() > 0.99
+        and np.array(behind)[hit & (np.array(points.geometric.y) > 0.1)].max() == 0
+    )
 
 
 def test_a_convex_body_has_no_inter_reflection(shot):
@@ -174,7 +203,9 @@ def test_common_scale_is_restored_and_direct_light_stays(shot):
     def picture(model):
         plastic, _ = plastic_at(model.field, points.uv, points.valid)
         intensity = dr.exp(dr.gather(mi.Float, model.log_intensity, mi.UInt32(0)))
-        return np.array(direct(points, plastic, Coat(), points.n, mi.Vector3f(0, 0, 3), intensity, mi.Float(1)))
+        return np.array(
+            direct(points, plastic, Coat(), points.n, mi.Vector3f(0, 0, 3), intensity, mi.Float(1))
+        )
 
     factors = mi.Float(np.tile([0.8, 1.0], field.size**2).astype(np.float32))
     darker = PlasticField(field.size, field.diffuse * 0.8, field.lobe * factors, field.slope)
@@ -187,11 +218,13 @@ def test_common_scale_is_restored_and_direct_light_stays(shot):
 
 
 def test_noise_of_inter_reflection_does_not_move_the_base(device):
-    """Few directions carry most of the light that comes back. With the weight of residuals that have that noise, bright estimates hardly
-    count and the base would be told to be brighter."""
+    """Few directions carry most of the light that comes back. With the weight of residuals that
+    have that noise, bright estimates hardly count and the base would be told to be brighter."""
     count = 400_000
     rng = np.random.default_rng(1)
-    back = [mi.Color3f(mi.Float(rng.lognormal(-4.0, 1.5, count).astype(np.float32))) for _ in range(2)]
+    back = [
+        mi.Color3f(mi.Float(rng.lognormal(-4.0, 1.5, count).astype(np.float32))) for _ in range(2)
+    ]
     expected_back = float(np.exp(-4.0 + 1.5**2 / 2))
     target, sigma = mi.Color3f(0.3 + expected_back), mi.Float(0.1)
 

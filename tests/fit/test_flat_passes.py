@@ -1,4 +1,5 @@
-"""Memory stays flat over hundreds of steps of every pass, and its steps launch the kernels that the first ones compiled."""
+"""Memory stays flat over hundreds of steps of every pass, and its steps launch the kernels that the
+first ones compiled."""
 
 from __future__ import annotations
 
@@ -14,24 +15,29 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.collection_surface import LightOptions, fit_collection_surface, start_collection_surface
-from relit.fit.flash import rates_by_step
-from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
-from relit.fit.instances import hold_distances, move_poses
-from relit.fit.kinship import start_kinship
-from relit.fit.loop import NoStage
-from relit.fit.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
-from relit.fit.volume import VolumeOptions, fit_volume, start_model
+from relit.fit.collection.surface import (
+    LightOptions,
+    fit_collection_surface,
+    start_collection_surface,
+)
+from relit.fit.flash.lobe_clusters import start_kinship
+from relit.fit.flash.recipe import rates_by_step
+from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
+from relit.fit.passes.optimiser import NoStage
+from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
+from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
+from relit.fit.registration.instances.views import hold_distances, move_poses
 from relit.geometry.sdf import node_positions
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import start_material
 from relit.materials.plastic_field import start_plastic
 from relit.materials.rough_plastic import Coat
-from relit.rendering.shade_flash import FlashAppearance, start_learnt
-from relit.rendering.shade_photos import shade_photos, start_photo_lights
-from relit.rendering.shade_world import shade_world, start_world_light
+from relit.rendering.appearance.flash_light import FlashAppearance, start_learnt
+from relit.rendering.appearance.light_per_photo import shade_photos, start_photo_lights
+from relit.rendering.appearance.world_light import shade_world, start_world_light
 
-# Tables of live objects grow for some hundred steps, ever slower (350 blocks of Python from step 150 to 490): not counted as left behind.
+# Tables of live objects grow for some hundred steps, ever slower (350 blocks of Python from step
+# 150 to 490): not counted as left behind.
 STEPS, SETTLED, LAST = 1000, 400, 990
 TEXELS = 8
 VOLUME = {"levels": (16,), "steps": (STEPS,), "rays": 64}
@@ -67,12 +73,22 @@ def flash_surface(shot, stage):
     features = np.random.default_rng(0).random((TEXELS, TEXELS, 4)).astype(np.float32)
     kinship = start_kinship(features, one > 0, np.stack([0.5 * one, 0.3 * one], -1), groups=4)
     field = start_plastic(np.full((TEXELS, TEXELS, 3), 0.3), 0.5 * one, 0.3 * one)
-    model = FlashModel(field, mi.Float(features.ravel()), kinship, mi.Float(0, 0, 0), mi.Float([1.5]), Coat())
-    fit_flash_surface(bank, cameras, mesh, model, FlashSurfaceOptions(STEPS, 128, 1, 1, patches=0.1, share_every=45), stage)
+    model = FlashModel(
+        field, mi.Float(features.ravel()), kinship, mi.Float(0, 0, 0), mi.Float([1.5]), Coat()
+    )
+    fit_flash_surface(
+        bank,
+        cameras,
+        mesh,
+        model,
+        FlashSurfaceOptions(STEPS, 128, 1, 1, patches=0.1, share_every=45),
+        stage,
+    )
 
 
 def collection_volume(shot, stage):
-    """A light for each photo; cameras and focal lengths move. The poses' own descents and those of held-out photos are such fits too."""
+    """A light for each photo; cameras and focal lengths move. The poses' own descents and those of
+    held-out photos are such fits too."""
     bank, *_ = shot
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
     model = ball_model()
@@ -85,9 +101,13 @@ def collection_volume(shot, stage):
 def collection_surface(shot, stage):
     """The lights of held-out photos alone are found by less of the same step."""
     bank, _, mesh, _ = shot
-    material = start_material(TEXELS, np.full((TEXELS, TEXELS, 3), ALBEDO_START, np.float32), 0.5, 0.05)
+    material = start_material(
+        TEXELS, np.full((TEXELS, TEXELS, 3), ALBEDO_START, np.float32), 0.5, 0.05
+    )
     model = start_collection_surface(material, np.full((bank.views, 3), 0.3), ALBEDO_START)
-    fit_collection_surface(bank, mesh, model, SurfaceOptions(**SURFACE), LightOptions(anchor=0.1), stage)
+    fit_collection_surface(
+        bank, mesh, model, SurfaceOptions(**SURFACE), LightOptions(anchor=0.1), stage
+    )
 
 
 def duplicates_volume(shot, stage):
@@ -97,7 +117,9 @@ def duplicates_volume(shot, stage):
     model.appearance = shade_world
     model.reflections, model.rates = start_world_light(0.3, bank.views)
     move_poses(bank, model)
-    options = VolumeOptions((12, 16), (SETTLED // 3, STEPS - SETTLED // 3), 64, refine_cameras=0.004, hold=40)
+    options = VolumeOptions(
+        (12, 16), (SETTLED // 3, STEPS - SETTLED // 3), 64, refine_cameras=0.004, hold=40
+    )
     fit_volume(bank, model, options, stage, 0, hold_distances)
 
 
@@ -134,16 +156,29 @@ class Watch(NoStage):
             dr.set_flag(dr.JitFlag.KernelHistory, False)
 
 
-PASSES = [flash_volume, flash_surface, collection_volume, collection_surface, duplicates_volume, duplicates_surface]
+PASSES = [
+    flash_volume,
+    flash_surface,
+    collection_volume,
+    collection_surface,
+    duplicates_volume,
+    duplicates_surface,
+]
 
 
 @pytest.mark.parametrize("run", PASSES, ids=lambda f: f.__name__)
 def test_memory_stays_flat(shot, run, monkeypatch):
-    monkeypatch.setattr("relit.fit.collection_surface.HISTORY", 100)  # full once the pass has settled
+    monkeypatch.setattr(
+        "relit.fit.collection.surface.HISTORY", 100
+    )  # full once the pass has settled
     watch = Watch()
     run(shot, watch)
-    arrays, objects, resident = (b - a for a, b in zip(watch.alive[SETTLED], watch.alive[LAST], strict=True))
+    arrays, objects, resident = (
+        b - a for a, b in zip(watch.alive[SETTLED], watch.alive[LAST], strict=True)
+    )
     assert arrays <= 2  # Dr.Jit's variables; what a step leaves behind counts 590 times
     assert objects < 0.9 * (LAST - SETTLED)  # of Python
     assert resident < 6  # MB, of everything
-    assert len(watch.kernels) >= 10 and all(k["cache_hit"] for k in watch.kernels if "cache_hit" in k)
+    assert len(watch.kernels) >= 10 and all(
+        k["cache_hit"] for k in watch.kernels if "cache_hit" in k
+    )

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from relit.cameras.se3 import look_at
-from relit.fit.hidden_light import HiddenLight, hidden_from
+from relit.fit.duplicates.indirect_light import HiddenLight, hidden_from
+from relit.geometry.se3 import look_at
 from relit.lighting.environment import Environment
 from relit.materials.field import start_material
 from relit.rendering.transport import TraceableMesh
@@ -22,8 +22,15 @@ def mesh_of(*parts) -> Mesh:
     starts = np.cumsum([0, *(len(p.vertices) for p, _ in parts)])
     faces = np.concatenate([p.faces + k for (p, _), k in zip(parts, starts, strict=False)])
     normals = np.concatenate([p.vertex_normals for p, _ in parts])
-    uvs = np.concatenate([np.full((len(p.vertices), 2), 0.5 if texels else -1.5) for p, texels in parts])
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32), uvs.astype(np.float32))
+    uvs = np.concatenate(
+        [np.full((len(p.vertices), 2), 0.5 if texels else -1.5) for p, texels in parts]
+    )
+    return Mesh(
+        vertices.astype(np.float32),
+        faces.astype(np.int32),
+        normals.astype(np.float32),
+        uvs.astype(np.float32),
+    )
 
 
 def even_light() -> Environment:
@@ -37,7 +44,9 @@ def paint():
 def floor(half: float, rows: int) -> trimesh.Trimesh:
     x, z = np.meshgrid(*2 * [np.linspace(-half, half, rows + 1)], indexing="ij")
     i = (np.arange(rows)[:, None] * (rows + 1) + np.arange(rows)).ravel()
-    faces = np.concatenate([np.stack([i, i + 1, i + rows + 1], 1), np.stack([i + 1, i + rows + 2, i + rows + 1], 1)])
+    faces = np.concatenate(
+        [np.stack([i, i + 1, i + rows + 1], 1), np.stack([i + 1, i + rows + 2, i + rows + 1], 1)]
+    )
     return trimesh.Trimesh(np.stack([x, 0 * x, z], -1).reshape(-1, 3), faces, process=False)
 
 
@@ -57,7 +66,9 @@ def test_ground_beneath_a_lid_is_dark_and_takes_its_reflectance_from_where_it_is
     lid = lid.subdivide_to_size(0.3)
     lid.apply_translation([0, 0.25, 0])
     n = len(ground.vertices)
-    traced = TraceableMesh(mesh_of((ground, False), (lid, True)), np.full((n + len(lid.vertices), 3), 0.3 * SKY))
+    traced = TraceableMesh(
+        mesh_of((ground, False), (lid, True)), np.full((n + len(lid.vertices), 3), 0.3 * SKY)
+    )
     is_ground = np.arange(n + len(lid.vertices)) < n
     under = (np.abs(traced.mesh.vertices[:, [0, 2]]) < 1.4).all(1) & is_ground
     light = HiddenLight(traced, under | ~is_ground, is_ground)
@@ -72,7 +83,10 @@ def test_ground_beneath_a_lid_is_dark_and_takes_its_reflectance_from_where_it_is
 
 
 def test_what_a_camera_sees_is_not_hidden():
-    ball, other = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.icosphere(subdivisions=3)
+    ball, other = (
+        trimesh.creation.icosphere(subdivisions=3),
+        trimesh.creation.icosphere(subdivisions=3),
+    )
     other.apply_translation([0, 0, -4])
     both = mesh_of((ball, True), (other, True))
     traced = TraceableMesh(both, np.ones((len(both.vertices), 3)))
@@ -81,5 +95,15 @@ def test_what_a_camera_sees_is_not_hidden():
     assert not hidden[: len(ball.vertices)][ball.vertices[:, 2] > 0.5].any()
     assert hidden[: len(ball.vertices)][ball.vertices[:, 2] < 0].all()
     assert hidden[len(ball.vertices) :].all()  # it stands behind the first one
-    beside = Camera(64, 64, 60.0, 60.0, 32.0, 32.0, look_at(np.array([8.0, 0.0, -2.0]), np.array([0.0, 0.0, -2.0])))
-    assert not hidden_from(traced, [camera, beside])[len(ball.vertices) :][other.vertices[:, 0] > 0.5].any()
+    beside = Camera(
+        64,
+        64,
+        60.0,
+        60.0,
+        32.0,
+        32.0,
+        look_at(np.array([8.0, 0.0, -2.0]), np.array([0.0, 0.0, -2.0])),
+    )
+    assert not hidden_from(traced, [camera, beside])[len(ball.vertices) :][
+        other.vertices[:, 0] > 0.5
+    ].any()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from relit.fit.hollows import HollowOptions, bare, opened, without
+from relit.fit.shape.hollows import HollowOptions, bare, opened, without
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
 from relit.scene import Camera
@@ -27,11 +27,14 @@ def cameras():
 
 @pytest.fixture(scope="module")
 def pot():
-    """A solid upright cylinder with a thin handle: what the hull of a pot is. Inside (N, N, N) bool, the lid's error map."""
+    """A solid upright cylinder with a thin handle: what the hull of a pot is. Inside (N, N, N)
+    bool, the lid's error map."""
     p = node_positions(N)
     r = np.hypot(p[..., 0], p[..., 2])
     body = (r < 0.5) & (np.abs(p[..., 1]) < 0.5)
-    handle = (np.abs(p[..., 2]) < 0.07) & (np.abs(p[..., 0] - 0.65) < 0.2) & (np.abs(p[..., 1]) < 0.07)
+    handle = (
+        (np.abs(p[..., 2]) < 0.07) & (np.abs(p[..., 0] - 0.65) < 0.2) & (np.abs(p[..., 1]) < 0.07)
+    )
     error = np.full((N, N, N), 0.005)
     error[(p[..., 1] > 0.4) & (r < 0.42)] = 0.03
     error[handle] = 0.03
@@ -52,7 +55,10 @@ def test_lid_is_opened_and_walls_and_handle_stay(pot):
 
 def test_evenly_explained_surface_is_left_alone(pot):
     body, handle, error = pot
-    assert opened(distance_of(body | handle), np.full_like(error, 0.01), cameras(), HollowOptions(N)) is None
+    assert (
+        opened(distance_of(body | handle), np.full_like(error, 0.01), cameras(), HollowOptions(N))
+        is None
+    )
 
 
 def test_bare_knows_what_silhouettes_need(pot):

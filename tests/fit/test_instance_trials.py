@@ -3,21 +3,27 @@
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
-from relit.fit import instance_trials
-from relit.fit.instance_options import Search
-from relit.fit.instance_search import Found
-from relit.fit.instance_trials import SAME, place_few, turned_apart
+from relit.fit.registration.instances import trials as instance_trials
+from relit.fit.registration.instances.options import Search
+from relit.fit.registration.instances.search import Found
+from relit.fit.registration.instances.trials import SAME, place_few, turned_apart
 from relit.geometry.hull import NoShape
+from relit.geometry.se3 import exp_so3
 
 
 def poses(seed, count=6):
-    return np.array([similarity(exp_so3(w), np.zeros(3)) for w in np.random.default_rng(seed).normal(size=(count, 3)) * 2])
+    return np.array(
+        [
+            similarity(exp_so3(w), np.zeros(3))
+            for w in np.random.default_rng(seed).normal(size=(count, 3)) * 2
+        ]
+    )
 
 
 def turned(some, by, only=None):
-    """The poses in another frame of the object; and `only` the objects of these numbers by something of its own."""
+    """The poses in another frame of the object; and `only` the objects of these numbers by
+    something of its own."""
     out = similarity(exp_so3(np.array(by)), np.zeros(3)) @ some
     for k in only or ():
         out[k] = similarity(exp_so3(np.array([0.0, 0.8, 0.0])), np.zeros(3)) @ out[k]
@@ -27,13 +33,17 @@ def turned(some, by, only=None):
 def test_a_turn_of_the_whole_is_no_difference():
     right = poses(0)
     assert turned_apart(right, turned(right, [0.4, 1.0, -2.0])) < 1e-4
-    assert abs(turned_apart(turned(right, [0.4, 1.0, -2.0], only=[1, 4]), right) - np.degrees(0.8)) < 1e-4
+    assert (
+        abs(turned_apart(turned(right, [0.4, 1.0, -2.0], only=[1, 4]), right) - np.degrees(0.8))
+        < 1e-4
+    )
     assert turned_apart(right, poses(1)) > SAME
 
 
 @pytest.fixture
 def search(monkeypatch):
-    """search(results, agreements, count) -> (poses, what was said, seeds): with what each search finds, or an error of its."""
+    """search(results, agreements, count) -> (poses, what was said, seeds): with what each search
+    finds, or an error of its."""
 
     def run(results, agreements, count=6, sure=False, **options):
         said, seeds, left, told = [], [], list(results), list(agreements)
@@ -46,7 +56,9 @@ def search(monkeypatch):
             return Found(one, np.full(len(one), 0.9), sure)
 
         monkeypatch.setattr(instance_trials, "place", place)
-        monkeypatch.setattr(instance_trials, "model_of_all", lambda *_, **__: (None, np.full(count, told.pop(0))))
+        monkeypatch.setattr(
+            instance_trials, "model_of_all", lambda *_, **__: (None, np.full(count, told.pop(0)))
+        )
         got, _ = place_few([None] * count, Search(**options), seed=7, say=said.append)
         return got, said, seeds
 

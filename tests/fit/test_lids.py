@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hollow_box import BOX, FIRST_SMALL, ROOM, THEN_SMALL, P, cameras, photographed
 
-from relit.fit import lids
-from relit.fit.lids import FIRST, flat_faces, open_lids, opened_at
+from relit.fit.shape import lids
+from relit.fit.shape.lids import FIRST, flat_faces, open_lids, opened_at
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import node_positions
 
@@ -15,17 +15,34 @@ from relit.geometry.sdf import node_positions
 def found(inside, progress=None):
     bank, start = photographed(inside)
     said = []
-    gone = open_lids(bank, cameras(), distance_of(BOX), start, said.append, 0, 2, FIRST_SMALL, THEN_SMALL, progress)
+    gone = open_lids(
+        bank,
+        cameras(),
+        distance_of(BOX),
+        start,
+        said.append,
+        0,
+        2,
+        FIRST_SMALL,
+        THEN_SMALL,
+        progress,
+    )
     return gone, said
 
 
 def test_hollow_under_a_lid_is_opened(monkeypatch):
-    """Each face is asked for what lies under it once, but again after one was opened; the steps of all trials are counted."""
+    """Each face is asked for what lies under it once, but again after one was opened; the steps of
+    all trials are counted."""
     asked, steps, real = [], [], lids.opened_at
-    monkeypatch.setattr(lids, "opened_at", lambda inside, lid, *rest: asked.append(lid) or real(inside, lid, *rest))
+    monkeypatch.setattr(
+        lids, "opened_at", lambda inside, lid, *rest: asked.append(lid) or real(inside, lid, *rest)
+    )
     gone, said = found(BOX & ~ROOM, steps.append)
     assert len(asked) <= len(flat_faces(distance_of(BOX))) + 1
-    assert steps == list(range(1, len(steps) + 1)) and len(steps) >= 2 * FIRST_SMALL.steps + 2 * THEN_SMALL.steps
+    assert (
+        steps == list(range(1, len(steps) + 1))
+        and len(steps) >= 2 * FIRST_SMALL.steps + 2 * THEN_SMALL.steps
+    )
     assert len(said) == 1 and "falls to" in said[0]
     assert (gone < 0)[ROOM & BOX].mean() > 0.6
     assert (gone < 0)[~ROOM].mean() < 0.01
@@ -53,11 +70,17 @@ def test_faces_of_a_box_and_what_is_behind_them():
 
 def test_ball_has_no_large_flat_face():
     r = np.linalg.norm(P, axis=-1)
-    assert max((f.sum() for f in flat_faces((r - 0.6).astype(np.float32))), default=0) < 0.12 * (np.abs(r - 0.6) < 0.03).sum()
+    assert (
+        max((f.sum() for f in flat_faces((r - 0.6).astype(np.float32))), default=0)
+        < 0.12 * (np.abs(r - 0.6) < 0.03).sum()
+    )
 
 
 @pytest.mark.parametrize("n", [24])
 def test_nothing_is_asked_of_a_thin_thing(n):
     p = node_positions(n)
     thin = (np.abs(p[..., 1]) < 0.09) & (np.hypot(p[..., 0], p[..., 2]) < 0.7)
-    assert all(opened_at(thin, f, cameras(), replace(FIRST, nodes=n)) is None for f in flat_faces(distance_of(thin)))
+    assert all(
+        opened_at(thin, f, cameras(), replace(FIRST, nodes=n)) is None
+        for f in flat_faces(distance_of(thin))
+    )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from relit.conventions import environment_directions, environment_solid_angles
-from relit.fit.light_steps import SIDES, LightSteps
-from relit.fit.loop import Adam
+from relit.fit.passes.light_steps import SIDES, LightSteps
+from relit.fit.passes.optimiser import Adam
 from relit.lighting.environment import cells_of_texels
 
 ROWS = 32
@@ -35,11 +35,14 @@ def test_cells_cover_the_map_once_and_are_alike_in_size(rows, side):
 
 
 def walk(step, truth, noise: float, steps: int = 250, rate: float = 0.05):
-    """Log radiance after steps along the gradients of Σ area (l - l*)², with noise as of a Monte Carlo estimate."""
+    """Log radiance after steps along the gradients of Σ area (l - l*)², with noise as of a Monte
+    Carlo estimate."""
     rng, light = np.random.default_rng(3), flat(np.zeros_like(truth))
     for i in range(steps):
         at = np.array(light).reshape(truth.shape)
-        gradient = AREA[..., None] * (at - truth) + noise * np.sqrt(AREA)[..., None] * rng.normal(size=truth.shape)
+        gradient = AREA[..., None] * (at - truth) + noise * np.sqrt(AREA)[..., None] * rng.normal(
+            size=truth.shape
+        )
         light = step(light, flat(gradient), rate * (1 - 0.95 * i / steps))
     return np.array(light).reshape(truth.shape)
 
@@ -49,8 +52,8 @@ def wrong(light, truth) -> float:
 
 
 def test_noise_moves_less_and_lamps_are_found():
-    """A dark room with one lamp, its pull much smaller than the noise of one step: nearer to the truth than Adam on the texels, all over
-    and at the pole."""
+    """A dark room with one lamp, its pull much smaller than the noise of one step: nearer to the
+    truth than Adam on the texels, all over and at the pole."""
     d = environment_directions(ROWS, 2 * ROWS)
     truth = np.full((ROWS, 2 * ROWS, 3), -1.0)
     truth[d @ np.array([0.6, 0.48, 0.64]) > np.cos(0.25)] = 2.5
@@ -62,7 +65,8 @@ def test_noise_moves_less_and_lamps_are_found():
 
 
 def test_a_texel_can_move_alone():
-    """Where there is no noise the map comes to any truth, texels that differ from their neighbours too."""
+    """Where there is no noise the map comes to any truth, texels that differ from their neighbours
+    too."""
     truth = np.random.default_rng(1).normal(size=(ROWS, 2 * ROWS, 3))
     light = walk(LightSteps(ROWS).step, truth, noise=0.0, steps=600)
     assert np.abs(light - truth)[ROWS // 2 - 3 : ROWS // 2 + 3].mean() < 0.02
@@ -83,5 +87,7 @@ def test_a_step_compiles_nothing_new():
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         one(light)
         history = dr.kernel_history()
-    assert any("cache_hit" in k for k in history) and all(k["cache_hit"] for k in history if "cache_hit" in k)
+    assert any("cache_hit" in k for k in history) and all(
+        k["cache_hit"] for k in history if "cache_hit" in k
+    )
     assert set(moves.adam) == {f"light_{side}" for side in SIDES}

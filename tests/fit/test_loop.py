@@ -5,11 +5,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.loop import Adam, cosine_decay, memory, recall, run_steps
+from relit.fit.passes.optimiser import Adam, cosine_decay, memory, recall, run_steps
 
 
 class Twin:
-    """Adam in float64 (Kingma & Ba 2015, Algorithm 1), epsilon outside the root; floor adds floor * mean(v) to every second moment."""
+    """Adam in float64 (Kingma & Ba 2015, Algorithm 1), epsilon outside the root; floor adds floor *
+    mean(v) to every second moment."""
 
     def __init__(self, size, beta1=0.9, beta2=0.99, floor=0.0):
         self.m, self.v, self.t = np.zeros(size), np.zeros(size), 0
@@ -34,14 +35,17 @@ def test_adam_equals_its_twin(floor):
     scale = 10.0 ** rng.uniform(-4, 2, size)
     for i in range(30):
         g = rng.normal(size=size) * scale * (rng.uniform(size=size) < 0.7)
-        a = adam.step(a, mi.Float(g.astype(np.float32)), 0.1 / (1 + i), mi.Float(ratio.astype(np.float32)))
+        a = adam.step(
+            a, mi.Float(g.astype(np.float32)), 0.1 / (1 + i), mi.Float(ratio.astype(np.float32))
+        )
         b = twin.step(b, g, 0.1 / (1 + i), ratio)
         dr.eval(a)
     np.testing.assert_allclose(np.array(a), b, rtol=1e-3, atol=1e-5)
 
 
 def test_the_floor_keeps_noise_from_moving_at_full_rate():
-    """Some entries have evidence, the rest noise a thousand times smaller: with the floor it stays, without it drifts."""
+    """Some entries have evidence, the rest noise a thousand times smaller: with the floor it stays,
+    without it drifts."""
     moved = {}
     for floor in (0.0, 1.0):
         rng = np.random.default_rng(1)
@@ -57,7 +61,11 @@ def test_the_floor_keeps_noise_from_moving_at_full_rate():
 
 
 def test_cosine_decay():
-    assert cosine_decay(0, 0.1) == 1 and cosine_decay(1, 0.1) == pytest.approx(0.1) and cosine_decay(0.5, 0.1) == pytest.approx(0.55)
+    assert (
+        cosine_decay(0, 0.1) == 1
+        and cosine_decay(1, 0.1) == pytest.approx(0.1)
+        and cosine_decay(0.5, 0.1) == pytest.approx(0.55)
+    )
     assert cosine_decay(-1, 0.1) == 1 and cosine_decay(7, 0.1) == pytest.approx(0.1)
 
 

@@ -1,11 +1,18 @@
-"""Loss terms against NumPy, what makes them fair to noise and to dark pixels, and the step along the common scale."""
+"""Loss terms against NumPy, what makes them fair to noise and to dark pixels, and the step along
+the common scale."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.losses import display_loss, display_weight, mask_loss, normal_loss, weighted_mean
-from relit.fit.surface import SurfaceOptions, dual_loss, light_prior
+from relit.fit.passes.losses import (
+    display_loss,
+    display_weight,
+    mask_loss,
+    normal_loss,
+    weighted_mean,
+)
+from relit.fit.passes.surface import SurfaceOptions, dual_loss, light_prior
 
 N = 500
 
@@ -32,12 +39,17 @@ def test_display_loss(pair):
     radiance, target = pair
     active = np.arange(N) % 3 == 0
     expected = ((radiance - target) ** 2 * (target + 0.02) ** -1.1).mean(1)
-    assert number(display_loss(colour(radiance), colour(target))) == pytest.approx(expected.mean(), rel=1e-4)
-    assert number(display_loss(colour(radiance), colour(target), mi.Bool(active))) == pytest.approx((expected * active).mean(), rel=1e-4)
+    assert number(display_loss(colour(radiance), colour(target))) == pytest.approx(
+        expected.mean(), rel=1e-4
+    )
+    assert number(display_loss(colour(radiance), colour(target), mi.Bool(active))) == pytest.approx(
+        (expected * active).mean(), rel=1e-4
+    )
 
 
 def test_equal_steps_of_the_display_cost_about_the_same(pair):
-    """A difference of one display code weighs alike in dark and in bright pixels; without the weight it would differ a hundredfold."""
+    """A difference of one display code weighs alike in dark and in bright pixels; without the
+    weight it would differ a hundredfold."""
     codes = np.linspace(0.15, 0.95, 9)
     linear = lambda c: np.repeat((c**2.2)[:, None], 3, 1)  # noqa: E731
     step = linear(codes + 0.01) - linear(codes)
@@ -54,24 +66,32 @@ def test_mask_loss(pair):
 
 
 def test_normal_loss():
-    """SfD Eq. (4): 0 for equal normals, 2 + |2n|_1 for opposite ones, and only where the weight says so."""
+    """SfD Eq. (4): 0 for equal normals, 2 + |2n|_1 for opposite ones, and only where the weight
+    says so."""
     n = np.random.default_rng(1).normal(size=(N, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     one, half = mi.Float(np.ones(N)), mi.Float((np.arange(N) < N // 2).astype(float))
     assert number(normal_loss(vector(n), vector(n), one)) == pytest.approx(0, abs=1e-5)
     expected = 2 + 2 * np.abs(n).sum(1)
-    assert number(normal_loss(vector(n), vector(-n), one)) == pytest.approx(expected.mean(), rel=1e-4)
-    assert number(normal_loss(vector(n), vector(-n), half)) == pytest.approx((expected * (np.arange(N) < N // 2)).mean(), rel=1e-4)
+    assert number(normal_loss(vector(n), vector(-n), one)) == pytest.approx(
+        expected.mean(), rel=1e-4
+    )
+    assert number(normal_loss(vector(n), vector(-n), half)) == pytest.approx(
+        (expected * (np.arange(N) < N // 2)).mean(), rel=1e-4
+    )
 
 
 def test_weighted_mean():
     v, w = np.random.default_rng(2).uniform(0, 1, (2, N))
-    assert number(weighted_mean(mi.Float(v), mi.Float(w))) == pytest.approx((v * w).sum() / w.sum(), rel=1e-4)
+    assert number(weighted_mean(mi.Float(v), mi.Float(w))) == pytest.approx(
+        (v * w).sum() / w.sum(), rel=1e-4
+    )
     assert number(weighted_mean(mi.Float(v), mi.Float(0 * w))) == 0
 
 
 def test_two_estimates_are_fair_to_noise():
-    """The expectation of the dual loss is the squared error whatever the noise; one estimate would add its variance."""
+    """The expectation of the dual loss is the squared error whatever the noise; one estimate would
+    add its variance."""
     rng = np.random.default_rng(3)
     count = 200_000
     target, mean, noise = np.full((count, 3), 0.4), 0.5, 0.3
@@ -81,7 +101,9 @@ def test_two_estimates_are_fair_to_noise():
     exact = (mean - 0.4) ** 2 * weight
     got = number(dual_loss(colour(a), colour(b), colour(target), valid))
     one = number(dual_loss(colour(a), colour(a), colour(target), valid))
-    assert got == pytest.approx(exact, rel=0.1) and one == pytest.approx((exact / weight + noise**2) * weight, rel=0.05)
+    assert got == pytest.approx(exact, rel=0.1) and one == pytest.approx(
+        (exact / weight + noise**2) * weight, rel=0.05
+    )
 
 
 def test_a_saturated_pixel_only_says_at_least():
@@ -103,10 +125,15 @@ def test_light_prior_prefers_even_grey_light():
     flat = np.full((4, 8, 3), 0.3, np.float32)
     tinted = flat + np.array([0.5, 0.0, -0.5], np.float32)
     rough = flat + rng.normal(size=(4, 8, 1)).astype(np.float32)
-    cost = {k: number(light_prior(mi.Float(v.ravel()), options)) for k, v in {"flat": flat, "tinted": tinted, "rough": rough}.items()}
+    cost = {
+        k: number(light_prior(mi.Float(v.ravel()), options))
+        for k, v in {"flat": flat, "tinted": tinted, "rough": rough}.items()
+    }
     turned = number(light_prior(mi.Float(np.roll(rough, 3, axis=1).ravel()), options))
     assert cost["flat"] < cost["tinted"] and cost["flat"] < cost["rough"]
-    assert turned == pytest.approx(cost["rough"], rel=1e-5)  # it wraps round: no direction is special
+    assert turned == pytest.approx(
+        cost["rough"], rel=1e-5
+    )  # it wraps round: no direction is special
 
 
 def test_light_prior_asks_more_of_tints_that_change():

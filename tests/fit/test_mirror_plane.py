@@ -7,14 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
-from relit.fit import instance_bodies, mirror_plane
-from relit.fit.instance_bodies import body_of
-from relit.fit.instance_options import Growth
-from relit.fit.instances import View, carved
-from relit.fit.mirror_plane import Hull, Plane, find_plane, flip, flipped_poses, flipped_views, normal_between, plane_scores, settled_plane
-from relit.fit.register import directions_around, views_from
+from relit.fit.registration.instances import bodies as instance_bodies
+from relit.fit.registration.instances import mirror_plane
+from relit.fit.registration.instances.bodies import body_of
+from relit.fit.registration.instances.mirror_plane import (
+    Hull,
+    Plane,
+    find_plane,
+    flip,
+    flipped_poses,
+    flipped_views,
+    normal_between,
+    plane_scores,
+    settled_plane,
+)
+from relit.fit.registration.instances.options import Growth
+from relit.fit.registration.instances.views import View, carved
+from relit.fit.registration.register import directions_around, views_from
+from relit.geometry.se3 import exp_so3
 from relit.scene import Camera
 
 PARTS = (0.6, 2.0, 0.1)
@@ -22,12 +33,16 @@ SIDE = 96
 
 
 def views_of_body(angles, colour, lopsided=0.0, parts=None):
-    """(views, poses) of two ellipsoids, one at the other's head, coloured by position, seen from `angles` (degrees about +y) and a little
-    from above. lopsided: how far the head lies to one side (x). parts: [(middle, half axes)] of other ellipsoids."""
+    """(views, poses) of two ellipsoids, one at the other's head, coloured by position, seen from
+    `angles` (degrees about +y) and a little from above. lopsided: how far the head lies to one side
+    (x). parts: [(middle, half axes)] of other ellipsoids."""
     u, v = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
     camera = Camera(SIDE, SIDE, 230.0, 230.0, SIDE / 2, SIDE / 2, np.eye(4))
     d = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
-    parts = parts or [(np.zeros(3), np.array([0.3, 0.25, 0.55])), (np.array([lopsided, 0.3, 0.35]), np.array([0.2, 0.3, 0.15]))]
+    parts = parts or [
+        (np.zeros(3), np.array([0.3, 0.25, 0.55])),
+        (np.array([lopsided, 0.3, 0.35]), np.array([0.2, 0.3, 0.15])),
+    ]
     views, poses = [], []
     for k, a in enumerate(angles):
         turn = exp_so3(np.array([0.0, np.radians(a), 0.0])) @ exp_so3(np.array([-0.4, 0.0, 0.0]))
@@ -77,7 +92,10 @@ def test_silhouettes_tell_where_the_plane_lies():
         moved[:, 0, 3] += offset
         share, found = Hull(views, moved).offset(np.array([1.0, 0.0, 0.0]))
         assert share > 0.98 and found == pytest.approx(offset, abs=0.03)
-    wrong = [Hull(views, poses).offset(np.array(n))[0] for n in ([0.0, 0.6, 0.8], [0.0, 0.0, 1.0], [0.6, 0.0, 0.8])]
+    wrong = [
+        Hull(views, poses).offset(np.array(n))[0]
+        for n in ([0.0, 0.6, 0.8], [0.0, 0.0, 1.0], [0.6, 0.0, 0.8])
+    ]
     assert max(wrong) < share - 0.01
 
 
@@ -85,7 +103,9 @@ def test_the_normal_is_that_of_the_pictures_that_agree():
     _, poses = views_of_body([-60, 10, 70, 150], even)
     normal = np.array([0.8, 0.0, -0.6])
     placed = flipped_poses(Plane(normal, 0.0), poses)
-    placed[3] = similarity(exp_so3(np.array([0.0, 1.5, 0.3])), np.zeros(3)) @ placed[3]  # one slid away
+    placed[3] = (
+        similarity(exp_so3(np.array([0.0, 1.5, 0.3])), np.zeros(3)) @ placed[3]
+    )  # one slid away
     start = exp_so3(np.array([0.0, 0.1, 0.0])) @ normal
     assert abs(normal_between(poses, placed, start) @ normal) > 1 - 1e-9
     assert np.array_equal(normal_between(poses[3:], placed[3:], start), start)
@@ -94,22 +114,39 @@ def test_the_normal_is_that_of_the_pictures_that_agree():
 def found_plane(views, poses, seed=0):
     o = Growth(nodes=28, steps=40, viewpoints=400)
     cameras = views_from(directions_around(o.viewpoints, seed), 5.0)
-    return body_of(views, poses, cameras, PARTS, o, steps=o.steps, seed=seed, pictures=flipped_views(views, PARTS)).plane
+    return body_of(
+        views,
+        poses,
+        cameras,
+        PARTS,
+        o,
+        steps=o.steps,
+        seed=seed,
+        pictures=flipped_views(views, PARTS),
+    ).plane
 
 
 def test_a_few_views_tell_the_plane_and_not_where_shape_and_paint_are_lopsided():
     views, poses = views_of_body([-100, -30, 40, 110], even)
     plane = found_plane(views, poses)
-    assert plane is not None and abs(plane.normal[0]) > np.cos(np.radians(8)) and abs(plane.offset) < 0.05
+    assert (
+        plane is not None
+        and abs(plane.normal[0]) > np.cos(np.radians(8))
+        and abs(plane.offset) < 0.05
+    )
     views, poses = views_of_body([-100, -30, 40, 110], odd, lopsided=0.25)
     other = found_plane(views, poses)
     assert other is None or abs(other.normal[0]) < 0.9
 
 
-def test_a_plane_must_lead_by_more_where_two_tell_it_and_the_last_one_is_believed_longer(monkeypatch):
+def test_a_plane_must_lead_by_more_where_two_tell_it_and_the_last_one_is_believed_longer(
+    monkeypatch,
+):
     views, poses = views_of_body([-100, -30, 40, 110], even)
     pictures, o = flipped_views(views, PARTS), Growth(nodes=28, steps=20)
-    body = body_of(views, poses, views_from(directions_around(200), 5.0), PARTS, o, steps=o.steps, seed=0)
+    body = body_of(
+        views, poses, views_from(directions_around(200), 5.0), PARTS, o, steps=o.steps, seed=0
+    )
     told: list[float] = []
 
     def settled(first, *others):
@@ -119,27 +156,41 @@ def test_a_plane_must_lead_by_more_where_two_tell_it_and_the_last_one_is_believe
 
     def found(count, *scores):
         told[:] = scores
-        return find_plane(views[:count], pictures.of(list(range(count))), poses[:count], body.gallery, body.render, PARTS)
+        return find_plane(
+            views[:count],
+            pictures.of(list(range(count))),
+            poses[:count],
+            body.gallery,
+            body.render,
+            PARTS,
+        )
 
     assert found(3, 1.0, 1.04, 0.9, 0.9) is not None and found(3, 1.0, 1.03, 0.9, 0.9) is None
     assert found(2, 1.0, 1.09, 0.9, 0.9) is None and found(2, 1.0, 1.11, 0.9, 0.9) is not None
     monkeypatch.undo()
     first, hull = Plane(np.array([1.0, 0.0, 0.0]), 0.0), Hull(views, poses)
-    near, far = Plane(np.array([np.cos(0.2), 0.0, np.sin(0.2)]), 0.0), Plane(np.array([0.0, 1.0, 0.0]), 0.0)
-    plain, kept, other = (settled_plane(first, hull, pictures, poses, body.render, PARTS, last)[0] for last in (None, near, far))
+    near, far = (
+        Plane(np.array([np.cos(0.2), 0.0, np.sin(0.2)]), 0.0),
+        Plane(np.array([0.0, 1.0, 0.0]), 0.0),
+    )
+    plain, kept, other = (
+        settled_plane(first, hull, pictures, poses, body.render, PARTS, last)[0]
+        for last in (None, near, far)
+    )
     assert kept == pytest.approx(plain + 0.03) and other == pytest.approx(plain)
 
 
 def test_a_body_is_bounded_by_its_mirror_image(monkeypatch):
-    """Two views from one side leave the far side open; mirrored, the outlines bound it from there too: half as far off as the hull, and
-    nearer than a taut body without a mirror."""
+    """Two views from one side leave the far side open; mirrored, the outlines bound it from there
+    too: half as far off as the hull, and nearer than a taut body without a mirror."""
     views, poses = views_of_body([60, 100], even)
     o = Growth(nodes=28, steps=40, viewpoints=60)
     across = views_from(np.array([[0.0, 0.3, 1.0], [0.0, 0.5, -1.0]]), 5.0)
     truth, _ = views_of_body([0, 180], even)
     width = [np.ptp(np.nonzero(v.mask.any(0))[0]) / SIDE * 5.0 * SIDE / v.camera.fx for v in truth]
     plain, twice = (
-        body_of(views, poses, across, PARTS, o, steps=o.steps, seed=0, plane=p) for p in (None, Plane(np.array([1.0, 0.0, 0.0]), 0.0))
+        body_of(views, poses, across, PARTS, o, steps=o.steps, seed=0, plane=p)
+        for p in (None, Plane(np.array([1.0, 0.0, 0.0]), 0.0))
     )
     assert len(twice.poses) == 2
     monkeypatch.setattr(instance_bodies, "taut_body", carved)
@@ -147,7 +198,10 @@ def test_a_body_is_bounded_by_its_mirror_image(monkeypatch):
 
     def widths(body):
         _, alpha = body.render(across)
-        return [np.ptp(np.nonzero((a > 0.5).any(0))[0]) / a.shape[1] * 5.0 * a.shape[1] / c.fx for a, c in zip(alpha, across, strict=True)]
+        return [
+            np.ptp(np.nonzero((a > 0.5).any(0))[0]) / a.shape[1] * 5.0 * a.shape[1] / c.fx
+            for a, c in zip(alpha, across, strict=True)
+        ]
 
     off = [np.mean(np.abs(np.subtract(widths(body), width))) for body in (twice, plain, hull)]
     assert off[0] < 0.5 * off[2] and off[0] < off[1]
@@ -159,5 +213,10 @@ def test_planes_are_scored_by_where_they_put_the_pictures():
     cameras = views_from(directions_around(400), 5.0)
     body = body_of(views, poses, cameras, PARTS, o, steps=o.steps, seed=0)
     normals = np.array([[1.0, 0, 0], [0, 1.0, 0], [0.7, 0.7, 0.1], [0, 0.6, 0.8]])
-    score = plane_scores(normals / np.linalg.norm(normals, axis=1, keepdims=True), flipped_views(views, PARTS), poses, body.gallery)
+    score = plane_scores(
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        flipped_views(views, PARTS),
+        poses,
+        body.gallery,
+    )
     assert score.argmax() == 0 and score[0] > 0.8

@@ -12,19 +12,27 @@ import pytest
 import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from relit.cameras.se3 import exp_so3
 from relit.conventions import similarity
-from relit.fit.instances import carved, pixel_bank, views_of
-from relit.fit.loop import NoStage
-from relit.fit.mirrored import MirroredRays, Symmetry, even_pixels, find_symmetry, mirrored_rays, mirrored_views, symmetry_from
-from relit.fit.outlines import trace
-from relit.fit.pixels import RayBatch
-from relit.fit.pose_passes import bounded_from_one_side
-from relit.fit.volume import VolumeOptions, fit_volume, start_model
+from relit.fit.duplicates.mirrored_silhouettes import (
+    MirroredRays,
+    Symmetry,
+    even_pixels,
+    find_symmetry,
+    mirrored_rays,
+    mirrored_views,
+    symmetry_from,
+)
+from relit.fit.duplicates.pose_passes import bounded_from_one_side
+from relit.fit.passes.optimiser import NoStage
+from relit.fit.passes.pixels import RayBatch
+from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
+from relit.fit.registration.instances.views import carved, pixel_bank, views_of
+from relit.fit.shape.outlines import trace
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
+from relit.geometry.se3 import exp_so3
 from relit.geometry.symmetry import Plane
-from relit.rendering.mitsuba_scene import build_geometry
+from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
 SIDE = 80
@@ -33,9 +41,16 @@ ACROSS = Plane(np.array([1.0, 0.0, 0.0]), 0.0)
 
 def body(*parts) -> Mesh:
     """Ellipsoids (semi-axes, middle) as one mesh."""
-    balls = [trimesh.creation.icosphere(subdivisions=3).apply_scale(axes).apply_translation(at) for axes, at in parts]
+    balls = [
+        trimesh.creation.icosphere(subdivisions=3).apply_scale(axes).apply_translation(at)
+        for axes, at in parts
+    ]
     whole = trimesh.util.concatenate(balls)
-    return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32), np.asarray(whole.vertex_normals, np.float32))
+    return Mesh(
+        np.asarray(whole.vertices, np.float32),
+        np.asarray(whole.faces, np.int32),
+        np.asarray(whole.vertex_normals, np.float32),
+    )
 
 
 def around(angles) -> np.ndarray:
@@ -50,8 +65,15 @@ def views_of_mesh(mesh: Mesh, angles) -> tuple[list, np.ndarray]:
     x, y = (a.ravel() + 0.5 for a in np.meshgrid(np.arange(SIDE), np.arange(SIDE)))
     views, poses = [], around(angles)
     for k, pose in enumerate(poses):
-        mask = np.isfinite(trace(build_geometry(mesh), camera.with_pose(pose), x, y)[0]).reshape(SIDE, SIDE)
-        views += views_of(np.repeat(0.4 * mask[..., None], 3, -1).astype(np.float32), mask.astype(np.int32) * (k + 1), camera, 10**6)
+        mask = np.isfinite(trace(build_geometry(mesh), camera.with_pose(pose), x, y)[0]).reshape(
+            SIDE, SIDE
+        )
+        views += views_of(
+            np.repeat(0.4 * mask[..., None], 3, -1).astype(np.float32),
+            mask.astype(np.int32) * (k + 1),
+            camera,
+            10**6,
+        )
     return views, poses
 
 
@@ -66,7 +88,9 @@ def test_rays_are_mirrored_and_only_the_others_move_poses():
     which = np.array([True, False, True, True, False, False])
     rays.turned(batch, mi.Bool(which))
     m = plane.mirror
-    assert np.allclose(np.array(batch.o).T, np.where(which[:, None], o @ m[:3, :3].T + m[:3, 3], o), atol=1e-6)
+    assert np.allclose(
+        np.array(batch.o).T, np.where(which[:, None], o @ m[:3, :3].T + m[:3, 3], o), atol=1e-6
+    )
     assert np.allclose(np.array(batch.d).T, np.where(which[:, None], d @ m[:3, :3].T, d), atol=1e-6)
     dr.backward(dr.sum(batch.o.x))
     assert np.allclose(np.array(dr.grad(start)), np.where(which, 0, 1))
@@ -88,35 +112,57 @@ def test_what_one_side_alone_has_is_left_out():
     even = even_pixels(Symmetry(ACROSS, lopsided), views[0], poses[0])
     view = views[0]
     scale = view.camera.fx / 4
-    row, left, right = (round(scale * at + middle) for at, middle in ((0.1, view.camera.cy), (-0.5, view.camera.cx), (0.5, view.camera.cx)))
+    row, left, right = (
+        round(scale * at + middle)
+        for at, middle in ((0.1, view.camera.cy), (-0.5, view.camera.cx), (0.5, view.camera.cx))
+    )
     assert not even[row, left] and not even[row, right]
     assert even[int(view.camera.cy), int(view.camera.cx)] and even.mean() > 0.6
     both = body(main, arm, ((0.12, 0.12, 0.12), (-0.45, 0.1, 0)))
     views, poses = views_of_mesh(both, [0])
     even, own = even_pixels(Symmetry(ACROSS, both), views[0], poses[0]), views[0].mask > 0.5
-    assert np.array_equal(~even, binary_dilation(own) & ~binary_erosion(own))  # along outlines alone
+    assert np.array_equal(
+        ~even, binary_dilation(own) & ~binary_erosion(own)
+    )  # along outlines alone
     bank = pixel_bank(views, poses)
     shown, there = mirrored_views(Symmetry(ACROSS, both), views, poses)
-    assert dr.width(mirrored_rays(Symmetry(ACROSS, both), bank, shown).pixels) == dr.width(bank.candidates) - (~even).sum()
-    assert np.allclose(there[0][:3, 3], poses[0][:3, 3] * [-1, 1, 1]) and np.linalg.det(there[0][:3, :3]) == pytest.approx(-1)
+    assert (
+        dr.width(mirrored_rays(Symmetry(ACROSS, both), bank, shown).pixels)
+        == dr.width(bank.candidates) - (~even).sum()
+    )
+    assert np.allclose(there[0][:3, 3], poses[0][:3, 3] * [-1, 1, 1]) and np.linalg.det(
+        there[0][:3, :3]
+    ) == pytest.approx(-1)
     nothing = [replace(v, known=np.zeros_like(v.known)) for v in shown]
     assert mirrored_rays(Symmetry(ACROSS, both), bank, nothing) is None
 
 
 def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
-    two = body(((0.3, 0.5, 0.4), (0, 0, 0)), ((0.1, 0.1, 0.5), (0, 0.3, 0.3)), ((0.3, 0.1, 0.1), (0, -0.4, 0.2)))
+    two = body(
+        ((0.3, 0.5, 0.4), (0, 0, 0)),
+        ((0.1, 0.1, 0.5), (0, 0.3, 0.3)),
+        ((0.3, 0.1, 0.1), (0, -0.4, 0.2)),
+    )
     large, small = ([SimpleNamespace(mask=np.zeros((40, side)))] for side in (134, 133))
-    poses = around([0, 40])  # mirrored at x = 0 the second one looks from 40 degrees beyond the first
+    poses = around(
+        [0, 40]
+    )  # mirrored at x = 0 the second one looks from 40 degrees beyond the first
     found = find_symmetry(two, large, poses)
-    assert found is not None and abs(found.plane.normal[0]) > 0.999 and abs(found.plane.offset) < 0.005
+    assert (
+        found is not None and abs(found.plane.normal[0]) > 0.999 and abs(found.plane.offset) < 0.005
+    )
     assert find_symmetry(two, small, poses) is None
     first, next_one = SimpleNamespace(symmetry=None), SimpleNamespace(symmetry=found)
     assert bounded_from_one_side(two, found, None) and bounded_from_one_side(two, found, first)
-    assert not bounded_from_one_side(two, found, next_one) and not bounded_from_one_side(two, None, None)
+    assert not bounded_from_one_side(two, found, next_one) and not bounded_from_one_side(
+        two, None, None
+    )
     round_one = body(((0.3, 0.5, 0.3), (0, 0, 0)))  # its mirror images show nothing new
     assert not bounded_from_one_side(round_one, Symmetry(ACROSS, round_one), None)
     kept = symmetry_from({"poses": np.eye(4), **found.arrays})
-    assert np.array_equal(kept.plane.mirror, found.plane.mirror) and np.array_equal(kept.mesh.faces, two.faces)
+    assert np.array_equal(kept.plane.mirror, found.plane.mirror) and np.array_equal(
+        kept.mesh.faces, two.faces
+    )
     assert build_geometry(kept.mesh) is not None and symmetry_from({"poses": np.eye(4)}) is None
     crooked = body(
         ((0.3, 0.5, 0.4), (0, 0, 0)),
@@ -125,7 +171,9 @@ def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
         ((0.1, 0.5, 0.1), (0.2, -0.4, -0.4)),
     )
     assert find_symmetry(crooked, large, poses) is None
-    assert find_symmetry(two, large, around([-70, -40, -25, 0, 30, 65])) is None  # what mirrored views show is seen already
+    assert (
+        find_symmetry(two, large, around([-70, -40, -25, 0, 30, 65])) is None
+    )  # what mirrored views show is seen already
 
 
 def test_views_from_one_side_bound_the_other_one_too():

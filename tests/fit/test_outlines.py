@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from relit.cameras.se3 import exp_so3
-from relit.fit.outlines import Outline, follow_outlines, follow_with_poses, laplacian, outline_of, solve, trace
+from relit.fit.shape.outlines import (
+    Outline,
+    follow_outlines,
+    follow_with_poses,
+    laplacian,
+    outline_of,
+    solve,
+    trace,
+)
+from relit.geometry.se3 import exp_so3
 from relit.geometry.tangents import vertex_normals
-from relit.rendering.mitsuba_scene import build_geometry
+from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
 SIZE, FOCAL = 96, 220.0
@@ -27,13 +35,20 @@ def looking_at_origin(direction) -> Camera:
 def ring(count: int = 24) -> list[Camera]:
     k = np.arange(count) + 0.5
     y, turn = 1 - 2 * k / count, k * np.pi * (3 - np.sqrt(5))
-    return [looking_at_origin(d) for d in np.stack([np.sqrt(1 - y * y) * np.cos(turn), y, np.sqrt(1 - y * y) * np.sin(turn)], -1)]
+    return [
+        looking_at_origin(d)
+        for d in np.stack(
+            [np.sqrt(1 - y * y) * np.cos(turn), y, np.sqrt(1 - y * y) * np.sin(turn)], -1
+        )
+    ]
 
 
 def ball(radius=0.5) -> Mesh:
     shape = trimesh.creation.icosphere(4, 1.0)
     v = np.asarray(shape.vertices)
-    return Mesh((v * radius).astype(np.float32), np.asarray(shape.faces, np.int32), v.astype(np.float32))
+    return Mesh(
+        (v * radius).astype(np.float32), np.asarray(shape.faces, np.int32), v.astype(np.float32)
+    )
 
 
 def coverage(mesh: Mesh, camera: Camera, side: int = 8) -> np.ndarray:
@@ -65,7 +80,9 @@ def test_an_outline_that_lies_too_far_out_is_told_in_pixels(seen):
 def test_a_dented_ball_becomes_round(seen):
     cameras, masks = seen
     truth = ball()
-    bump = 0.008 * np.sin(6 * truth.vertices[:, 0] / 0.5) + 0.006  # .6 of a pixel at most, wider than a pixel
+    bump = (
+        0.008 * np.sin(6 * truth.vertices[:, 0] / 0.5) + 0.006
+    )  # .6 of a pixel at most, wider than a pixel
     start = Mesh((truth.vertices * (1 + bump[:, None] / 0.5)).astype(np.float32), truth.faces)
     start = replace(start, normals=vertex_normals(start))
     out = follow_outlines(start, cameras, masks, 3)
@@ -80,14 +97,26 @@ def test_masks_that_contradict_one_another_move_less(seen):
     cameras, masks = seen
     rng = np.random.default_rng(0)
     loose = [shifted(m, *rng.integers(-1, 2, 2)) for m in masks]
-    moved = lambda found: np.abs(np.linalg.norm(follow_outlines(ball(), cameras, found, 1).vertices, axis=1) - 0.5).max()  # noqa: E731
+
+    def moved(found):
+        return np.abs(
+            np.linalg.norm(follow_outlines(ball(), cameras, found, 1).vertices, axis=1) - 0.5
+        ).max()
+
     assert moved(masks) < 0.0015  # a tenth of a pixel
     assert moved(loose) < 0.01  # the masks are wrong by up to 1.4 pixels, .019
 
 
 def test_no_outline_no_move(seen):
     mesh = ball()
-    empty = Outline(np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    empty = Outline(
+        np.zeros((0, 3), int),
+        np.zeros((0, 3)),
+        np.zeros((0, 3)),
+        np.zeros((0, 2)),
+        np.zeros(0),
+        np.zeros(0),
+    )
     assert not solve(mesh, [empty]).any()
     still = follow_outlines(mesh, seen[0], seen[1], 0)
     assert still is mesh
@@ -95,11 +124,15 @@ def test_no_outline_no_move(seen):
 
 def test_the_laplacian_of_what_is_even_is_nothing():
     mesh = ball()
-    assert np.abs(laplacian(mesh.faces, len(mesh.vertices)) @ np.ones(len(mesh.vertices))).max() < 1e-9
+    assert (
+        np.abs(laplacian(mesh.faces, len(mesh.vertices)) @ np.ones(len(mesh.vertices))).max() < 1e-9
+    )
 
 
 def test_poses_follow_too():
-    shape = trimesh.creation.box([0.7, 0.5, 0.9]).subdivide_loop(4)  # an egg with no symmetry of turning
+    shape = trimesh.creation.box([0.7, 0.5, 0.9]).subdivide_loop(
+        4
+    )  # an egg with no symmetry of turning
     truth = Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces, np.int32))
     truth = replace(truth, normals=vertex_normals(truth))
     cameras = ring(8)
@@ -108,7 +141,10 @@ def test_poses_follow_too():
     wrong = []
     for c in cameras:
         motion = np.eye(4)
-        motion[:3, :3], motion[:3, 3] = exp_so3(rng.normal(0, 0.001, 3)), rng.normal(0, 0.004, 3) * [1, 1, 5]
+        motion[:3, :3], motion[:3, 3] = (
+            exp_so3(rng.normal(0, 0.001, 3)),
+            rng.normal(0, 0.004, 3) * [1, 1, 5],
+        )
         wrong.append(c.with_pose(c.world_from_camera @ motion))
     known = [np.ones_like(m) for m in masks]
     for k in known[:4]:
@@ -130,14 +166,29 @@ def test_places_follow_and_turns_stay(seen):
         off.append(c.with_pose(c.world_from_camera @ step))
     known = [np.ones_like(m) for m in masks]
     mesh, poses = follow_with_poses(ball(0.505), off, masks, known, 4, turning=False)
-    size = np.linalg.norm(mesh.vertices, axis=1).mean() / 0.5  # all together may be nearer to a smaller object
+    size = (
+        np.linalg.norm(mesh.vertices, axis=1).mean() / 0.5
+    )  # all together may be nearer to a smaller object
 
     def off_by(poses):
-        return np.array([np.linalg.norm(p[:3, 3] - c.world_from_camera[:3, 3]) for p, c in zip(poses, cameras, strict=True)])
+        return np.array(
+            [
+                np.linalg.norm(p[:3, 3] - c.world_from_camera[:3, 3])
+                for p, c in zip(poses, cameras, strict=True)
+            ]
+        )
 
-    before, after = off_by([c.world_from_camera for c in off]), off_by([np.block([[p[:3, :3], p[:3, 3:] / size], [p[3:]]]) for p in poses])
+    before, after = (
+        off_by([c.world_from_camera for c in off]),
+        off_by([np.block([[p[:3, :3], p[:3, 3:] / size], [p[3:]]]) for p in poses]),
+    )
     assert size == pytest.approx(1, abs=0.02)
     assert np.median(before) > 0.025 and np.median(after) < 0.25 * np.median(before)
-    assert all(np.array_equal(p[:3, :3], o.world_from_camera[:3, :3]) for p, o in zip(poses, off, strict=True))
-    same, there = follow_with_poses(mesh, off[:4], masks[:4], known[:4], 4, turning=False, still=True)
+    assert all(
+        np.array_equal(p[:3, :3], o.world_from_camera[:3, :3])
+        for p, o in zip(poses, off, strict=True)
+    )
+    same, there = follow_with_poses(
+        mesh, off[:4], masks[:4], known[:4], 4, turning=False, still=True
+    )
     assert same is mesh and np.abs(there - poses[:4])[:, :3, 3].max() < 0.004

@@ -1,4 +1,5 @@
-"""Over-exposed pixels have no say over the volume pass, the groups' lobes and the patches; photos that cannot clip are fitted as before."""
+"""Over-exposed pixels have no say over the volume pass, the groups' lobes and the patches; photos
+that cannot clip are fitted as before."""
 
 import drjit as dr
 import flash_ball as scene
@@ -6,12 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit import flash_surface, volume
-from relit.fit.flash_surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
-from relit.fit.kinship import start_kinship
-from relit.fit.loop import NoStage
-from relit.fit.pixels import well_exposed
-from relit.fit.volume import VolumeOptions, fit_volume, start_model
+from relit.fit.flash import surface as flash_surface
+from relit.fit.flash.lobe_clusters import start_kinship
+from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
+from relit.fit.passes import volume
+from relit.fit.passes.optimiser import NoStage
+from relit.fit.passes.pixels import well_exposed
+from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
 from relit.geometry.sdf import node_positions
 from relit.materials.plastic_field import start_plastic
 from relit.materials.rough_plastic import Coat
@@ -23,7 +25,8 @@ def shot(device):
 
 
 def burnt(bank, value: float):
-    """(pixels (n,) that are burnt, rgbm): a quarter of the object's pixels with `value` in one channel."""
+    """(pixels (n,) that are burnt, rgbm): a quarter of the object's pixels with `value` in one
+    channel."""
     rgbm = np.array(bank.rgbm).reshape(-1, 4).copy()
     chosen = np.flatnonzero(rgbm[:, 3] > 0.99)[::4]
     rgbm[chosen, 1] = value
@@ -83,20 +86,36 @@ def test_surface_pass(shot, monkeypatch, saturated):
 
         monkeypatch.setattr(flash_surface, name, call)
 
-    watch("share_evidence", lambda kin, field, uv, plastic, shade, photo, weight, rate: (weight.x, weight.z))
+    watch(
+        "share_evidence",
+        lambda kin, field, uv, plastic, shade, photo, weight, rate: (weight.x, weight.z),
+    )
     watch("pyramid_loss", lambda a, b, target, weight: (dr.max(target), weight))
-    watch("ssim_loss", lambda a, b, target, valid: (dr.max(target), dr.select(valid, mi.Float(1), 0)))
+    watch(
+        "ssim_loss", lambda a, b, target, valid: (dr.max(target), dr.select(valid, mi.Float(1), 0))
+    )
     pixels = dr.arange(mi.UInt32, 64 * 12)
     monkeypatch.setattr(flash_surface, "draw_patches", lambda bank, rng, count: pixels)
     known, one = np.ones((size, size), bool), np.ones((size, size))
     features = np.random.default_rng(0).uniform(0, 1, (size, size, 4))
     kin = start_kinship(features, known, np.stack([0.5 * one, 0.2 * one], -1), groups=4)
     field = start_plastic(0.4 * np.ones((size, size, 3)), 0.5 * one, 0.2 * one)
-    model = FlashModel(field, mi.Float(features.astype(np.float32).ravel()), kin, mi.Float(0, 0, 0), mi.Float([1.7]), Coat())
+    model = FlashModel(
+        field,
+        mi.Float(features.astype(np.float32).ravel()),
+        kin,
+        mi.Float(0, 0, 0),
+        mi.Float([1.7]),
+        Coat(),
+    )
     options = FlashSurfaceOptions(steps=1, points=64 * 12, directions=0, patches=0.1)
     monkeypatch.setattr(bank, "saturated", saturated)
     fit_flash_surface(bank, views, mesh, model, options, NoStage(), 0)
     is_burnt = np.isin(np.arange(64 * 12), chosen)
     for weight in (*seen["share_evidence"], seen["pyramid_loss"][1], seen["ssim_loss"][1]):
         assert (weight[~is_burnt] > 0).any()
-        assert (weight[is_burnt] == 0).all() if np.isfinite(saturated) else (weight[is_burnt] > 0).any()
+        assert (
+            (weight[is_burnt] == 0).all()
+            if np.isfinite(saturated)
+            else (weight[is_burnt] > 0).any()
+        )

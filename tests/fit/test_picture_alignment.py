@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.fit.picture_alignment import laid_on, moved_by
+from relit.fit.shape.picture_alignment import laid_on, moved_by
 
 SIZE = 64
 
@@ -22,7 +22,9 @@ def similarity(right, down, degrees=0.0, size=1.0):
     return np.column_stack([linear, np.array([right, down]) + middle - linear @ middle])
 
 
-@pytest.mark.parametrize("truth", [similarity(1.3, -0.8), similarity(0, 0, 2.0), similarity(0.5, 1.0, -1.5, 1.03)])
+@pytest.mark.parametrize(
+    "truth", [similarity(1.3, -0.8), similarity(0, 0, 2.0), similarity(0.5, 1.0, -1.5, 1.03)]
+)
 def test_a_similarity_is_found(picture, truth):
     where = np.zeros((SIZE, SIZE), bool)
     where[12:50, 10:54] = True

@@ -5,10 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import exp_so3
 from relit.conventions import environment_directions, move_points, similarity
-from relit.fit.pile_scene import ONTO, SETTLED, distance_in, ground_reflectance, light_below, parts_of_the_way, set_down
+from relit.fit.duplicates.scene import (
+    ONTO,
+    SETTLED,
+    distance_in,
+    ground_reflectance,
+    light_below,
+    parts_of_the_way,
+    set_down,
+)
 from relit.geometry.sdf import node_positions
+from relit.geometry.se3 import exp_so3
 
 UP = np.array([0.0, -np.sin(0.9), -np.cos(0.9)])  # of the ground, in the photo's frame
 
@@ -42,11 +50,18 @@ def test_what_floats_or_sinks_is_set_down_along_its_line_of_sight():
     seen = [similarity(m[:3, :3], m[:3, 3] * (1 + e)) for m, e in zip(true, errors, strict=True)]
     wrong = np.array([np.linalg.inv(m) for m in seen])
     tilted = exp_so3(np.array([0.02, 0.0, 0.01])) @ UP
-    poses, plane, count = set_down(vertices, wrong, np.stack([[0, 0, 10.02], tilted]), lambda points: np.full(points.shape[:-1], 9.0))
+    poses, plane, count = set_down(
+        vertices,
+        wrong,
+        np.stack([[0, 0, 10.02], tilted]),
+        lambda points: np.full(points.shape[:-1], 9.0),
+    )
     assert count == 16
     assert np.degrees(np.arccos(plane[1] @ UP)) < 0.6
     before = [np.linalg.norm(a[:3, 3] - b[:3, 3]) for a, b in zip(seen, true, strict=True)]
-    after = [np.linalg.norm(np.linalg.inv(p)[:3, 3] - b[:3, 3]) for p, b in zip(poses, true, strict=True)]
+    after = [
+        np.linalg.norm(np.linalg.inv(p)[:3, 3] - b[:3, 3]) for p, b in zip(poses, true, strict=True)
+    ]
     assert np.median(after) < 0.6 * np.median(before)
     for p in poses:
         assert abs(((move_points(np.linalg.inv(p), vertices) - plane[0]) @ plane[1]).min()) < 0.01
@@ -56,14 +71,20 @@ def test_what_floats_or_sinks_is_set_down_along_its_line_of_sight():
 def test_what_lies_deep_in_the_ground_is_lifted_and_what_floats_over_another_comes_nearer_to_it():
     vertices = ball(6000)
     side, ahead = np.cross(UP, [1.0, 0, 0]), np.array([1.0, 0, 0])
-    at = [np.array([0, 0, 10.0]) + a * 1.9 * ahead + b * 1.9 * side + 0.8 * UP for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    at = [
+        np.array([0, 0, 10.0]) + a * 1.9 * ahead + b * 1.9 * side + 0.8 * UP
+        for a in (-1, 0, 1)
+        for b in (-1, 0, 1)
+    ]
     at.append((at[4] + at[5]) / 2 + np.sqrt(1.6**2 - 0.95**2) * UP)  # on two others
     at.append(at[0] + 1.6 * UP)  # on top of one
     turn = np.eye(3)
     true = [similarity(turn, p) for p in at]
     shift = np.zeros(len(at))
     shift[3], shift[9], shift[10] = 0.015, -0.004, 0.004
-    seen = np.array([np.linalg.inv(similarity(turn, p * (1 + e))) for p, e in zip(at, shift, strict=True)])
+    seen = np.array(
+        [np.linalg.inv(similarity(turn, p * (1 + e))) for p, e in zip(at, shift, strict=True)]
+    )
     poses, _, count = set_down(vertices, seen, np.stack([[0, 0, 10.0], UP]), from_ball)
     assert count == 3  # the others are where they belong
     for k, p in enumerate(poses):
@@ -91,7 +112,9 @@ def test_few_objects_stay_where_they_are():
 
 def test_ground_under_an_even_sky_shows_its_reflectance():
     light = np.full((32, 64, 3), 2.0, np.float32)
-    assert ground_reflectance(light, np.array([0, 1.0, 0]), np.array([0.6, 0.4, 0.2])) == pytest.approx([0.3, 0.2, 0.1], rel=0.01)
+    assert ground_reflectance(
+        light, np.array([0, 1.0, 0]), np.array([0.6, 0.4, 0.2])
+    ) == pytest.approx([0.3, 0.2, 0.1], rel=0.01)
 
 
 def test_below_the_ground_is_the_ground():
@@ -102,13 +125,14 @@ def test_below_the_ground_is_the_ground():
 
 
 def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
-    """Two rows of balls that touch each other: together they block much of each other's sky, moved apart none of it."""
+    """Two rows of balls that touch each other: together they block much of each other's sky, moved
+    apart none of it."""
     import drjit as dr
     import mitsuba as mi
     from flash_ball import ball as round_ball
 
-    from relit.fit.pile_scene import alone_bank, scene_mesh, spread
-    from relit.fit.pixels import batch_of
+    from relit.fit.duplicates.scene import alone_bank, scene_mesh, spread
+    from relit.fit.passes.pixels import batch_of
     from relit.lighting.environment import Environment
     from relit.materials.brdf import Surface
     from relit.rendering.transport import TraceableMesh, first_hits, sample_lights
@@ -116,7 +140,11 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
 
     mesh = round_ball(16, 32)
     camera = Camera(96, 64, 160.0, 160.0, 48.0, 32.0, np.eye(4))
-    standing = [similarity(np.eye(3), np.array([1.45 * x, -1.1 * z, 8 + 0.95 * z])) for z in (0, 1) for x in (-1, 0, 1)]
+    standing = [
+        similarity(np.eye(3), np.array([1.45 * x, -1.1 * z, 8 + 0.95 * z]))
+        for z in (0, 1)
+        for x in (-1, 0, 1)
+    ]
     labels = np.zeros((64, 96), np.int32)
     for k, pose in reversed(list(enumerate(standing))):  # the front row last
         x, y, z = camera.project(pose[None, :3, 3])[0]
@@ -124,7 +152,10 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
         labels[np.hypot(column + 0.5 - x, row + 0.5 - y) < 150 * 0.7 / z] = 10 + k
     labels[0, 0] = 99  # an object that is not registered
     pixels = Pixels(np.random.default_rng(0).random((64, 96, 3)).astype(np.float32), labels=labels)
-    parts = {"radiance": np.ones((6, len(mesh.vertices), 3), np.float32), "plane": np.stack([[0, 0.7, 8.0], [0, -1.0, 0]])}
+    parts = {
+        "radiance": np.ones((6, len(mesh.vertices), 3), np.float32),
+        "plane": np.stack([[0, 0.7, 8.0], [0, -1.0, 0]]),
+    }
     place = similarity(np.eye(3), np.array([0, 0, -8.7]))
     moves = spread(standing, place)
     own = camera.with_pose(place)
@@ -136,10 +167,17 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
     points = first_hits(traced, batch.o, batch.d)
     hit = np.array(points.valid)
     assert hit.mean() > 0.8 and set(np.array(batch.view)[hit].tolist()) == set(range(bank.views))
-    number = np.linalg.norm(np.array(points.x).T[hit][:, None] - (moves + [m[:3, 3] + place[:3, 3] for m in standing]), axis=2).argmin(1)
+    number = np.linalg.norm(
+        np.array(points.x).T[hit][:, None] - (moves + [m[:3, 3] + place[:3, 3] for m in standing]),
+        axis=2,
+    ).argmin(1)
     assert (np.array(batch.view)[hit] == number).all()  # each view shows the instance that it is of
     count = dr.width(points.x)
-    grey = Surface(mi.Color3f(dr.full(mi.Float, 0.5, count)), dr.full(mi.Float, 0.5, count), dr.zeros(mi.Float, count))
+    grey = Surface(
+        mi.Color3f(dr.full(mi.Float, 0.5, count)),
+        dr.full(mi.Float, 0.5, count),
+        dr.zeros(mi.Float, count),
+    )
 
     def open_sky(scene, points):
         rng = mi.PCG32(size=count, initstate=3)
@@ -150,7 +188,9 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
     assert open_sky(traced, points) > 0.995
     together, radiance = scene_mesh(mesh, parts, standing, place, pixels, camera)
     scene = TraceableMesh(together, radiance)
-    points.x = mi.Point3f(points.x - dr.gather(mi.Vector3f, mi.Float(moves.ravel().astype(np.float32)), batch.view))
+    points.x = mi.Point3f(
+        points.x - dr.gather(mi.Vector3f, mi.Float(moves.ravel().astype(np.float32)), batch.view)
+    )
     assert open_sky(scene, points) < 0.75
 
 

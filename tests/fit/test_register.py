@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from volume_lump import errors, photos_of, volume_lump
 
-from relit.cameras.se3 import exp_so3
+from relit.geometry.se3 import exp_so3
 from relit.scene import Camera
 
 pytest.importorskip("mitsuba")
@@ -14,7 +14,15 @@ def model():
 
 
 def test_photos_are_found_and_refined(model):
-    from relit.fit.register import crop_photo, directions_around, make_gallery, refine, search, views_from, volume_render
+    from relit.fit.registration.register import (
+        crop_photo,
+        directions_around,
+        make_gallery,
+        refine,
+        search,
+        views_from,
+        volume_render,
+    )
 
     photos = photos_of(model, 8, np.random.default_rng(1))
     crops = [crop_photo(*p) for p in photos]
@@ -27,12 +35,14 @@ def test_photos_are_found_and_refined(model):
     right = first < 20
     assert errors(poses, photos)[right].max() < 2.0
     assert (scores[right] > 0.97).all()
-    centres = np.array([np.linalg.norm(p[:3, 3] - c.centre) for p, (_, _, c) in zip(poses, photos, strict=True)])
+    centres = np.array(
+        [np.linalg.norm(p[:3, 3] - c.centre) for p, (_, _, c) in zip(poses, photos, strict=True)]
+    )
     assert centres[right].max() < 0.12  # of 3.5: the distance comes from the size of the silhouette
 
 
 def test_unknown_pixels_do_not_mislead(model):
-    from relit.fit.register import crop_photo, refine, volume_render
+    from relit.fit.registration.register import crop_photo, refine, volume_render
 
     rgb, mask, camera = photos_of(model, 1, np.random.default_rng(5))[0]
     weight = np.ones_like(mask)
@@ -42,14 +52,24 @@ def test_unknown_pixels_do_not_mislead(model):
     start[:3] = exp_so3(np.array([0.0, 0.1, 0.1])) @ start[:3]
     crops = [crop_photo(rgb * weight[..., None], hidden, camera, weight)]
     pose, _ = refine(crops, start[None], volume_render(model))
-    blind, _ = refine([crop_photo(rgb * weight[..., None], hidden, camera)], start[None], volume_render(model))
+    blind, _ = refine(
+        [crop_photo(rgb * weight[..., None], hidden, camera)], start[None], volume_render(model)
+    )
     photo = [(rgb, mask, camera)]
     assert errors(pose, photo)[0] < 3.0
     assert errors(pose, photo)[0] < errors(blind, photo)[0]
 
 
 def test_the_search_can_be_restricted(model):
-    from relit.fit.register import crop_photo, directions_around, make_gallery, near, search, views_from, volume_render
+    from relit.fit.registration.register import (
+        crop_photo,
+        directions_around,
+        make_gallery,
+        near,
+        search,
+        views_from,
+        volume_render,
+    )
 
     photos = photos_of(model, 2, np.random.default_rng(3))
     crops = [crop_photo(*p) for p in photos]
@@ -64,14 +84,16 @@ def test_the_search_can_be_restricted(model):
 
 
 def test_an_empty_mask_is_refused():
-    from relit.fit.register import crop_photo
+    from relit.fit.registration.register import crop_photo
 
     with pytest.raises(ValueError, match="empty"):
-        crop_photo(np.zeros((20, 20, 3)), np.zeros((20, 20)), Camera(20, 20, 20, 20, 10, 10, np.eye(4)))
+        crop_photo(
+            np.zeros((20, 20, 3)), np.zeros((20, 20)), Camera(20, 20, 20, 20, 10, 10, np.eye(4))
+        )
 
 
 def test_detail_tells_a_decoration_from_the_shading_on_it():
-    from relit.fit.register import SIDE, all_scores, rings_of
+    from relit.fit.registration.register import SIDE, all_scores, rings_of
 
     rng = np.random.default_rng(0)
     x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
@@ -83,12 +105,19 @@ def test_detail_tells_a_decoration_from_the_shading_on_it():
         return np.repeat((0.6 - 0.35 * spots)[..., None], 3, 2).astype(np.float32)
 
     ours, other = spotted(), spotted()
-    shade = np.exp(0.05 * (x - 32))[..., None].astype(np.float32)  # five times as bright on one side
+    shade = np.exp(0.05 * (x - 32))[..., None].astype(
+        np.float32
+    )  # five times as bright on one side
 
     def score(a, b, parts):
-        one, two = (rings_of((p * mask[..., None])[None].astype(np.float32), mask[None], parts=parts) for p in (a, b))
+        one, two = (
+            rings_of((p * mask[..., None])[None].astype(np.float32), mask[None], parts=parts)
+            for p in (a, b)
+        )
         return float(all_scores(one, two)[0, 0, 0])
 
     plain, fine = (0.6, 2.0, 0.6), (0.6, 1.0, 0.1, 0.6)
-    assert score(ours * shade, ours, fine) > score(other, ours, fine) + 0.2  # the same under another light, against another
+    assert (
+        score(ours * shade, ours, fine) > score(other, ours, fine) + 0.2
+    )  # the same under another light, against another
     assert score(ours * shade, ours, plain) < score(ours * shade, ours, fine) - 0.1

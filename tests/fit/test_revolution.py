@@ -1,4 +1,5 @@
-"""Bodies of revolution: axes from outlines, turns from decoration. The pictures are splatted points, with nothing of what is tested."""
+"""Bodies of revolution: axes from outlines, turns from decoration. The pictures are splatted
+points, with nothing of what is tested."""
 
 from __future__ import annotations
 
@@ -7,18 +8,45 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from relit.cameras.se3 import rotation_angle
 from relit.conventions import similarity
-from relit.fit import instance_revolution, instance_search
-from relit.fit.beside import EMPTY, FILLED_OR_EMPTY, SHOWN, filled, turned_by_outline
-from relit.fit.instance_options import Search
-from relit.fit.instance_revolution import EXACT, LONGER, flat, place_revolved
-from relit.fit.instances import View, crops_of
-from relit.fit.register import crop_rings
-from relit.fit.revolution import KNOTS, OUTLINE, axis_of, drawn, leaning_back
-from relit.fit.revolution_fit import Revolved, adjusted_pose, fit_revolution, fitted, leaning_the_other_way, outline_of, seats_of
-from relit.fit.turns import Told, cells_read, empty_board, turned_about
-from relit.fit.unrolled import LATITUDES, ONE_VALUE, TURNS, cells_of, one_value, turned_by_decoration
+from relit.fit.registration.instances import revolution_search as instance_revolution
+from relit.fit.registration.instances import search as instance_search
+from relit.fit.registration.instances.azimuth_maps import (
+    Told,
+    cells_read,
+    empty_board,
+    turned_about,
+)
+from relit.fit.registration.instances.options import Search
+from relit.fit.registration.instances.protrusions import (
+    EMPTY,
+    FILLED_OR_EMPTY,
+    SHOWN,
+    filled,
+    turned_by_outline,
+)
+from relit.fit.registration.instances.revolution import KNOTS, OUTLINE, axis_of, drawn, leaning_back
+from relit.fit.registration.instances.revolution_fit import (
+    Revolved,
+    adjusted_pose,
+    fit_revolution,
+    fitted,
+    leaning_the_other_way,
+    outline_of,
+    seats_of,
+)
+from relit.fit.registration.instances.revolution_search import EXACT, LONGER, flat, place_revolved
+from relit.fit.registration.instances.unrolled import (
+    LATITUDES,
+    ONE_VALUE,
+    TURNS,
+    cells_of,
+    one_value,
+    turned_by_decoration,
+)
+from relit.fit.registration.instances.views import View, crops_of
+from relit.fit.registration.register import crop_rings
+from relit.geometry.se3 import rotation_angle
 from relit.scene import Camera
 
 SIDE, FOCAL, AWAY = 96, 190.0, 4.0
@@ -30,8 +58,15 @@ def bottle() -> tuple[np.ndarray, np.ndarray]:
     """Points (M, 3) and colours (M, 3) of a bottle with random blots."""
     y, a = np.linspace(-0.75, 0.75, 360), np.linspace(0, 2 * np.pi, 720, endpoint=False)
     r = np.interp(y, [-0.75, 0.15, 0.4, 0.75], [0.36, 0.36, 0.15, 0.15])
-    side = np.stack([r[:, None] * np.sin(a), np.broadcast_to(y[:, None], (360, 720)), r[:, None] * np.cos(a)], -1)
-    blots = gaussian_filter(np.random.default_rng(5).standard_normal((360, 720, 3)), (14, 22, 0), mode=("nearest", "wrap", "nearest"))
+    side = np.stack(
+        [r[:, None] * np.sin(a), np.broadcast_to(y[:, None], (360, 720)), r[:, None] * np.cos(a)],
+        -1,
+    )
+    blots = gaussian_filter(
+        np.random.default_rng(5).standard_normal((360, 720, 3)),
+        (14, 22, 0),
+        mode=("nearest", "wrap", "nearest"),
+    )
     colour = np.where(blots > 0.35 * blots.std((0, 1)), 0.6, 0.15)
     ends = [
         np.stack([r0 * np.sin(a), np.full(720, h), r0 * np.cos(a)], -1)
@@ -39,7 +74,9 @@ def bottle() -> tuple[np.ndarray, np.ndarray]:
         for r0 in np.linspace(0, most, 80)
     ]
     ends = np.concatenate(ends)
-    return np.concatenate([side.reshape(-1, 3), ends]), np.concatenate([colour.reshape(-1, 3), np.full(ends.shape, 0.3)])
+    return np.concatenate([side.reshape(-1, 3), ends]), np.concatenate(
+        [colour.reshape(-1, 3), np.full(ends.shape, 0.3)]
+    )
 
 
 def ellipsoid(*radii: float) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +130,13 @@ def wrong_by(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def test_outlines_tell_the_axes(bottles):
     _, _, poses, body, seats = bottles
     assert body.misfit < EXACT
-    off = min(([min(off_axis(p, t, sign) for p in some) for some, t in zip(seats, poses, strict=True)] for sign in (1, -1)), key=sum)
+    off = min(
+        (
+            [min(off_axis(p, t, sign) for p in some) for some, t in zip(seats, poses, strict=True)]
+            for sign in (1, -1)
+        ),
+        key=sum,
+    )
     assert np.median(off) < 4 and max(off) < 12, off
     assert np.median([len(some) for some in seats]) <= 2
 
@@ -101,7 +144,10 @@ def test_outlines_tell_the_axes(bottles):
 def test_decoration_tells_the_turns_about_them(bottles, told):
     off = wrong_by(told.poses, bottles[2])
     assert (off < 12).sum() >= 5, off
-    assert (off[told.sure] < 20).all(), (off, told.sure)  # those that say that they are sure are right
+    assert (off[told.sure] < 20).all(), (
+        off,
+        told.sure,
+    )  # those that say that they are sure are right
     assert told.sure.sum() >= 4, told.sure
 
 
@@ -111,10 +157,14 @@ def test_a_pose_that_is_off_comes_back_to_its_outline(bottles):
         outline, tilted = outline_of(crop), pose.copy()
         tilt = Rotation.from_rotvec(np.radians([0.0, 0.0, 6.0])).as_matrix()
         tilted[:3] = np.concatenate([tilt @ pose[:3, :3], (tilt @ pose[:3, 3:])], 1)
-        before = float(((outline.weights(r := outline.residual(body.profile, tilted)) * r) ** 2).sum())
+        before = float(
+            ((outline.weights(r := outline.residual(body.profile, tilted)) * r) ** 2).sum()
+        )
         back, level = adjusted_pose(outline, body.profile, tilted)
         assert level < 0.3 * before
-        assert np.degrees(np.arccos(axis_of(back) @ axis_of(pose))) < 5  # shortening by a tilt is nearly that by distance
+        assert (
+            np.degrees(np.arccos(axis_of(back) @ axis_of(pose))) < 5
+        )  # shortening by a tilt is nearly that by distance
 
 
 def test_an_axis_that_leans_the_other_way_has_nearly_the_same_outline(bottles):
@@ -123,14 +173,20 @@ def test_an_axis_that_leans_the_other_way_has_nearly_the_same_outline(bottles):
     pose = similarity(turn, turn @ np.array([0, 0, -150.0]))
     other, again = leaning_back(pose), leaning_back(leaning_back(pose))
     assert np.allclose(axis_of(again), axis_of(pose), atol=1e-9)
-    assert np.isclose(axis_of(other)[2], -axis_of(pose)[2], atol=1e-9) and abs(axis_of(pose)[2]) > 0.2
-    a, b = (drawn(body.profile, Camera(SIDE, SIDE, 6000.0, 6000.0, SIDE / 2, SIDE / 2, p)) > 0.5 for p in (pose, other))
+    assert (
+        np.isclose(axis_of(other)[2], -axis_of(pose)[2], atol=1e-9) and abs(axis_of(pose)[2]) > 0.2
+    )
+    a, b = (
+        drawn(body.profile, Camera(SIDE, SIDE, 6000.0, 6000.0, SIDE / 2, SIDE / 2, p)) > 0.5
+        for p in (pose, other)
+    )
     assert a.sum() > 500 and (a ^ b).sum() < 0.03 * a.sum()
 
 
 @pytest.mark.parametrize("radii", [(0.8, 0.55, 0.3), (0.7, 0.7, 0.7)], ids=["lopsided", "ball"])
 def test_what_has_no_axis_is_not_sure_of_it(radii):
-    """Ellipses are the outlines of a body of revolution too: what is not sure of its turns is left to the search."""
+    """Ellipses are the outlines of a body of revolution too: what is not sure of its turns is left
+    to the search."""
     views, _ = pile(*ellipsoid(*radii), 4, 1)
     found = place_revolved(views, crops_of(views), OPTIONS)
     assert found is None or (not found.certain and len(found.placed.unsure) > len(views) / 2)
@@ -154,7 +210,10 @@ def test_two_maps_of_one_decoration_are_laid_on_each_other():
 
 @pytest.mark.parametrize(
     "evidence, summed, values",
-    [(ONE_VALUE, one_value, np.linspace(-2, 2, 9)), (FILLED_OR_EMPTY, lambda _, total: filled(total), [SHOWN, EMPTY])],
+    [
+        (ONE_VALUE, one_value, np.linspace(-2, 2, 9)),
+        (FILLED_OR_EMPTY, lambda _, total: filled(total), [SHOWN, EMPTY]),
+    ],
     ids=["decoration", "outline"],
 )
 def test_what_a_shifted_map_gains_is_the_change_of_the_evidence(evidence, summed, values):
@@ -164,7 +223,9 @@ def test_what_a_shifted_map_gains_is_the_change_of_the_evidence(evidence, summed
     def some(count):
         row, column = np.divmod(rng.choice(rows * turns, count, replace=False), turns)
         weights = rng.uniform(0.2, 1, count)
-        return cells_read(evidence, (rows, turns), row, column, rng.choice(values, count), weights), weights
+        return cells_read(
+            evidence, (rows, turns), row, column, rng.choice(values, count), weights
+        ), weights
 
     for turn, count in enumerate((30, 20, 25)):
         board.gains(some(4)[0])  # asked before it has changed
@@ -180,12 +241,17 @@ def test_what_a_shifted_map_gains_is_the_change_of_the_evidence(evidence, summed
 def test_a_turn_about_the_axis_leaves_the_axis(bottles):
     pose = bottles[3].poses[0]
     turned = turned_about(pose, 0.7)
-    assert np.allclose(axis_of(turned), axis_of(pose)) and np.isclose(rotation_angle(turned[:3, :3] @ pose[:3, :3].T), np.degrees(0.7))
+    assert np.allclose(axis_of(turned), axis_of(pose)) and np.isclose(
+        rotation_angle(turned[:3, :3] @ pose[:3, :3].T), np.degrees(0.7)
+    )
 
 
 @pytest.mark.parametrize(
     "short, long, told, asked",
-    [({"a": 0.75, "b": 0.74, "c": 0.6}, {"a": 0.7, "b": 0.76}, "b", 5), ({"a": 0.75, "b": 0.6, "c": 0.5}, {}, "a", 3)],
+    [
+        ({"a": 0.75, "b": 0.74, "c": 0.6}, {"a": 0.7, "b": 0.76}, "b", 5),
+        ({"a": 0.75, "b": 0.6, "c": 0.5}, {}, "a", 3),
+    ],
     ids=["close", "clear"],
 )
 def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, long, told, asked):
@@ -196,7 +262,10 @@ def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, 
         return (short if steps == 2 * o.steps else long)[poses]
 
     monkeypatch.setattr(instance_revolution, "decoration_agreement", agreement)
-    assert instance_revolution.likeliest(None, None, {name: name for name in short}, OPTIONS, 0) == told
+    assert (
+        instance_revolution.likeliest(None, None, {name: name for name in short}, OPTIONS, 0)
+        == told
+    )
     assert len(fits) == asked and max(fits) == (LONGER if long else 1) * 2 * OPTIONS.steps
 
 
@@ -207,70 +276,120 @@ def test_without_an_answer_that_agrees_none_is_likeliest(monkeypatch):
 
 
 def placed(bottles, told, monkeypatch, sure):
-    """(what the search finds, what it has said), of bottles some of which are sure of what decoration tells."""
+    """(what the search finds, what it has said), of bottles some of which are sure of what
+    decoration tells."""
     views, _, _, body, seats = bottles
     said: list[str] = []
-    monkeypatch.setattr("relit.fit.instance_revolution.fit_revolution", lambda *a: body)
-    monkeypatch.setattr("relit.fit.instance_revolution.seats_of", lambda *a: seats)
-    monkeypatch.setattr("relit.fit.instance_revolution.turned_by_decoration", lambda *a: {"colour": Told(told.poses, sure)})
-    monkeypatch.setattr(instance_search, "settled", lambda views, crops, rings, poses, scores, o, **_: (poses, scores, set()))
+    monkeypatch.setattr(
+        "relit.fit.registration.instances.revolution_search.fit_revolution", lambda *a: body
+    )
+    monkeypatch.setattr(
+        "relit.fit.registration.instances.revolution_search.seats_of", lambda *a: seats
+    )
+    monkeypatch.setattr(
+        "relit.fit.registration.instances.revolution_search.turned_by_decoration",
+        lambda *a: {"colour": Told(told.poses, sure)},
+    )
+    monkeypatch.setattr(
+        instance_search,
+        "settled",
+        lambda views, crops, rings, poses, scores, o, **_: (poses, scores, set()),
+    )
     found = instance_search.place(views, OPTIONS, say=said.append)
-    off = min(([off_axis(p, t, sign) for p, t in zip(found.poses, bottles[2], strict=True)] for sign in (1, -1)), key=sum)
+    off = min(
+        (
+            [off_axis(p, t, sign) for p, t in zip(found.poses, bottles[2], strict=True)]
+            for sign in (1, -1)
+        ),
+        key=sum,
+    )
     assert np.median(off) < 6, off
     return found, said
 
 
 def test_bodies_of_revolution_that_are_sure_are_not_searched(bottles, told, monkeypatch):
-    monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses"))
+    monkeypatch.setattr(
+        instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
+    )
     found, _ = placed(bottles, told, monkeypatch, np.ones(7, bool))
     assert found.sure
 
 
-def test_of_bodies_of_revolution_that_are_mostly_sure_the_others_are_left_to_the_end(bottles, told, monkeypatch):
-    monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses"))
+def test_of_bodies_of_revolution_that_are_mostly_sure_the_others_are_left_to_the_end(
+    bottles, told, monkeypatch
+):
+    monkeypatch.setattr(
+        instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
+    )
     for name in ("confirmed", "settled"):  # which could lose the axes
-        monkeypatch.setattr(instance_search, name, lambda *a, **k: pytest.fail("a search over all poses"))
+        monkeypatch.setattr(
+            instance_search, name, lambda *a, **k: pytest.fail("a search over all poses")
+        )
     found, said = placed(bottles, told, monkeypatch, np.arange(7) > 1)
     assert (np.flatnonzero(found.scores == instance_search.LEFT_OUT) == [0, 1]).all()
     assert any("2 of 7 are not sure" in text for text in said)
 
 
-def test_bodies_of_revolution_that_are_not_sure_keep_their_axes_where_the_search_finds_nothing(bottles, told, monkeypatch):
+def test_bodies_of_revolution_that_are_not_sure_keep_their_axes_where_the_search_finds_nothing(
+    bottles, told, monkeypatch
+):
     asked = []
     monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: asked.append(1) or {})
-    monkeypatch.setattr("relit.fit.instance_revolution.flat", lambda poses: False)
+    monkeypatch.setattr(
+        "relit.fit.registration.instances.revolution_search.flat", lambda poses: False
+    )
     _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
     assert asked and any("7 of 7 are not sure" in text for text in said)
 
 
-def test_bodies_of_revolution_on_one_plane_are_not_searched_whether_they_are_sure_or_not(bottles, told, monkeypatch):
-    monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses"))
-    monkeypatch.setattr("relit.fit.instance_revolution.flat", lambda poses: True)
+def test_bodies_of_revolution_on_one_plane_are_not_searched_whether_they_are_sure_or_not(
+    bottles, told, monkeypatch
+):
+    monkeypatch.setattr(
+        instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
+    )
+    monkeypatch.setattr(
+        "relit.fit.registration.instances.revolution_search.flat", lambda poses: True
+    )
     _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
     assert any("7 of 7 are not sure" in text for text in said)
 
 
 def standing_on_a_plane(count: int, off: float) -> np.ndarray:
-    """Poses (count, 4, 4) of objects in any turn whose middles lie on a plane that leans, but for `off` along the line of sight."""
+    """Poses (count, 4, 4) of objects in any turn whose middles lie on a plane that leans, but for
+    `off` along the line of sight."""
     rng = np.random.default_rng(8)
     x, y = rng.uniform(-2.5, 2.5, (2, count))
     middles = np.stack([x, y, 9 + 0.5 * y + off * rng.standard_normal(count)], -1)
-    return np.array([similarity(r, -r @ m) for r, m in zip(Rotation.random(count, random_state=2).as_matrix(), middles, strict=True)])
+    return np.array(
+        [
+            similarity(r, -r @ m)
+            for r, m in zip(
+                Rotation.random(count, random_state=2).as_matrix(), middles, strict=True
+            )
+        ]
+    )
 
 
 def test_a_plane_that_the_middles_lie_on_is_seen_whatever_their_turns():
     assert flat(standing_on_a_plane(10, 0.2)) and not flat(standing_on_a_plane(10, 1.0))
-    assert not flat(standing_on_a_plane(5, 0.0))  # any three points have a plane, and of five little is left to tell
+    assert not flat(
+        standing_on_a_plane(5, 0.0)
+    )  # any three points have a plane, and of five little is left to tell
 
 
 # ---------------------------------------------------------------- what has a handle
 
 
 def cup() -> tuple[np.ndarray, np.ndarray]:
-    """Points (M, 3) and colours (M, 3) of a cup with a handle on one side and the same stripe at every quarter turn."""
+    """Points (M, 3) and colours (M, 3) of a cup with a handle on one side and the same stripe at
+    every quarter turn."""
     y, a = np.linspace(-0.5, 0.5, 300), np.linspace(0, 2 * np.pi, 720, endpoint=False)
     r = np.interp(y, [-0.5, -0.4, 0.5], [0.3, 0.33, 0.6])
-    side = np.stack([r[:, None] * np.sin(a), np.broadcast_to(y[:, None], (300, 720)), r[:, None] * np.cos(a)], -1).reshape(-1, 3)
+    side = np.stack(
+        [r[:, None] * np.sin(a), np.broadcast_to(y[:, None], (300, 720)), r[:, None] * np.cos(a)],
+        -1,
+    ).reshape(-1, 3)
     stripes = np.where(np.cos(4 * np.arctan2(side[:, 0], side[:, 2])) > 0.7, 0.2, 0.7)
     ends = [
         np.stack([r0 * np.sin(a), np.full(720, h), r0 * np.cos(a)], -1)
@@ -285,19 +404,28 @@ def cup() -> tuple[np.ndarray, np.ndarray]:
     return points, np.repeat(grey[:, None], 3, 1)
 
 
-CUP = np.concatenate([[-0.5, 0.5], np.interp(np.linspace(-0.5, 0.5, KNOTS), [-0.5, -0.4, 0.5], [0.3, 0.33, 0.6])])  # its profile
+CUP = np.concatenate(
+    [[-0.5, 0.5], np.interp(np.linspace(-0.5, 0.5, KNOTS), [-0.5, -0.4, 0.5], [0.3, 0.33, 0.6])]
+)  # its profile
 
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_a_handle_tells_the_turns_front_and_back(seed):
-    """Of axes that are right to a few degrees. Those who hide the handle, or show it before the body, are not sure."""
+    """Of axes that are right to a few degrees. Those who hide the handle, or show it before the
+    body, are not sure."""
     views, poses = pile(*cup(), 10, seed)
     rng = np.random.default_rng(1)
     shaken = [
-        similarity(r := Rotation.from_rotvec(0.03 * x).as_matrix() @ p[:3, :3], r @ p[:3, :3].T @ p[:3, 3])
+        similarity(
+            r := Rotation.from_rotvec(0.03 * x).as_matrix() @ p[:3, :3], r @ p[:3, :3].T @ p[:3, 3]
+        )
         for p, x in zip(poses, rng.standard_normal((10, 3)), strict=True)
     ]
-    told = turned_by_outline(views, CUP, np.array([turned_about(p, a) for p, a in zip(shaken, rng.uniform(0, 6, 10), strict=True)]))
+    told = turned_by_outline(
+        views,
+        CUP,
+        np.array([turned_about(p, a) for p, a in zip(shaken, rng.uniform(0, 6, 10), strict=True)]),
+    )
     off = wrong_by(told.poses, poses)
     assert told.sure.sum() >= 5 and (off[told.sure] < 15).all(), (off, told.sure)
 
@@ -311,7 +439,9 @@ def test_axes_that_all_lean_the_wrong_way_come_back(bottles):
     """From afar all outlines together are the same so; perspective tells."""
     _, crops, _, body, _ = bottles
     outlines, rings = [outline_of(c) for c in crops], crop_rings(crops, OUTLINE)
-    wrong = Revolved(body.profile, np.array([leaning_back(p) for p in body.poses]), np.full(len(crops), 0.01))
+    wrong = Revolved(
+        body.profile, np.array([leaning_back(p) for p in body.poses]), np.full(len(crops), 0.01)
+    )
     assert np.median([off_axis(a, b, 1) for a, b in zip(wrong.poses, body.poses, strict=True)]) > 20
     back = fitted(outlines, rings, leaning_the_other_way(outlines, wrong))
     assert back.misfit < 1.5 * body.misfit

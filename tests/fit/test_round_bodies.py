@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 from test_outlines import coverage, looking_at_origin
 
-from relit.fit.duplicates_options import DuplicatesOptions
-from relit.fit.instances import View
-from relit.fit.round_bodies import made_round
+from relit.fit.duplicates.options import DuplicatesOptions
+from relit.fit.duplicates.round_bodies import made_round
+from relit.fit.registration.instances.views import View
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import node_positions, redistance
 
@@ -29,14 +29,19 @@ def egg(bumps=0.0, lobes=7):
 
 
 def asked(mesh, truth, **changes):
-    """What `made_round` makes of a mesh whose instances are silhouettes of the truth; what it says."""
+    """What `made_round` makes of a mesh whose instances are silhouettes of the truth; what it
+    says."""
     said, views, poses = [], [], []
     for k, side in enumerate(SIDES):
         camera = looking_at_origin(side)
         mask = coverage(truth, camera)
-        views.append(View(k, camera, np.repeat(mask[..., None], 3, -1) * 0.5, mask, np.ones_like(mask), 1.0))
+        views.append(
+            View(k, camera, np.repeat(mask[..., None], 3, -1) * 0.5, mask, np.ones_like(mask), 1.0)
+        )
         poses.append(camera.world_from_camera)
-    return made_round(mesh, views, np.array(poses), SimpleNamespace(say=said.append), replace(OPTIONS, **changes)), said
+    return made_round(
+        mesh, views, np.array(poses), SimpleNamespace(say=said.append), replace(OPTIONS, **changes)
+    ), said
 
 
 def test_bumps_go():
@@ -44,7 +49,12 @@ def test_bumps_go():
     even, said = asked(bumpy, truth)
     side = lambda m: np.abs(m.vertices[:, 1]) < 0.4  # noqa: E731
     wide = lambda y: (WIDE - SLOPE * y) * np.sqrt(1 - (y / LONG) ** 2)  # noqa: E731
-    off = lambda m: np.std((np.hypot(m.vertices[:, 0], m.vertices[:, 2]) - wide(m.vertices[:, 1]))[side(m)])  # noqa: E731
+
+    def off(m):
+        return np.std(
+            (np.hypot(m.vertices[:, 0], m.vertices[:, 2]) - wide(m.vertices[:, 1]))[side(m)]
+        )
+
     assert off(even) < 0.3 * off(bumpy)
     assert len(said) == 1 and "body of revolution" in said[0]
 

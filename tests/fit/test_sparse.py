@@ -1,14 +1,16 @@
 import numpy as np
 from scipy.sparse import bmat, diags, random_array
 
-from relit.fit.sparse import solved_symmetric
+from relit.fit.shape.sparse import solved_symmetric
 
 
 def test_few_dense_rows_beside_a_mesh():
     """As poses are among vertices: they meet all of them."""
     rng = np.random.default_rng(0)
     vertices, poses = 400, 12
-    chain = diags([-np.ones(vertices - 1), np.full(vertices, 3.0), -np.ones(vertices - 1)], [-1, 0, 1])
+    chain = diags(
+        [-np.ones(vertices - 1), np.full(vertices, 3.0), -np.ones(vertices - 1)], [-1, 0, 1]
+    )
     seen = random_array((poses, vertices), density=0.8, rng=rng)
     matrix = bmat([[500 * diags(np.ones(poses)), seen], [seen.T, chain]])
     right = rng.normal(size=(poses + vertices, 2))

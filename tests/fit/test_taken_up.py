@@ -1,4 +1,5 @@
-"""A pass that was stopped and is taken up from its checkpoint moves as it would have moved: same random numbers, same moments."""
+"""A pass that was stopped and is taken up from its checkpoint moves as it would have moved: same
+random numbers, same moments."""
 
 from __future__ import annotations
 
@@ -6,10 +7,10 @@ import numpy as np
 import pytest
 from test_flat_passes import PASSES, SURFACE, TEXELS, VOLUME, ball_model, shot  # noqa: F401
 
-from relit.fit.explore import explore
-from relit.fit.loop import NoStage
-from relit.fit.surface import SurfaceOptions, fit_surface, start_surface
-from relit.fit.volume import VolumeOptions, fit_volume
+from relit.fit.passes.explore import explore
+from relit.fit.passes.optimiser import NoStage
+from relit.fit.passes.surface import SurfaceOptions, fit_surface, start_surface
+from relit.fit.passes.volume import VolumeOptions, fit_volume
 from relit.rendering.background import start_background
 
 AT, MORE = 70, 3
@@ -26,7 +27,9 @@ def multiview_surface(shot, stage):  # noqa: F811
     """With steps that paint and light trade."""
     bank, _, mesh, _ = shot
     o = SurfaceOptions(**SURFACE, light=8)
-    model = start_surface(np.full((TEXELS, TEXELS, 3), 0.3, np.float32), np.ones((TEXELS, TEXELS), bool), 0.3, o)
+    model = start_surface(
+        np.full((TEXELS, TEXELS, 3), 0.3, np.float32), np.ones((TEXELS, TEXELS), bool), 0.3, o
+    )
     fit_surface(bank, mesh, model, o, stage)
 
 
@@ -57,7 +60,11 @@ class Stopped(NoStage):
             raise Over
 
 
-@pytest.mark.parametrize("run", [*PASSES, multiview_volume, multiview_surface, field_of_everything], ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    "run",
+    [*PASSES, multiview_volume, multiview_surface, field_of_everything],
+    ids=lambda f: f.__name__,
+)
 def test_a_pass_moves_on_as_if_it_had_not_been_stopped(shot, run):  # noqa: F811
     whole = Stopped()
     with pytest.raises(Over):

@@ -1,4 +1,5 @@
-"""Turns about an axis that were guessed, told by rendering: a glossy vase beside another one, under a sun."""
+"""Turns about an axis that were guessed, told by rendering: a glossy vase beside another one, under
+a sun."""
 
 from dataclasses import replace
 
@@ -6,14 +7,14 @@ import numpy as np
 import pytest
 from test_turn_guess import AXIS, vase
 
-from relit.cameras.se3 import look_at, rotation_angle
 from relit.conventions import similarity
-from relit.fit import duplicates
-from relit.fit import turns_as_shown as module
-from relit.fit.instances import View
-from relit.fit.turn_guess import turned_by
-from relit.fit.turns_as_shown import turned_as_shown
-from relit.rendering.photographed import as_photographed
+from relit.fit.duplicates import azimuth_refinement as module
+from relit.fit.duplicates import recipe as duplicates
+from relit.fit.duplicates.azimuth_refinement import turned_as_shown
+from relit.fit.registration.instances.azimuth import turned_by
+from relit.fit.registration.instances.views import View
+from relit.geometry.se3 import look_at, rotation_angle
+from relit.reference.photographed import as_photographed
 from relit.run import Run
 from relit.scene import Asset, Camera, Instance, Material
 
@@ -29,15 +30,35 @@ def photographed():
     paint = np.kron(rng.uniform(0.1, 0.9, (8, 8, 3)), np.ones((8, 8, 1))).astype(np.float32)
     light = np.full((16, 32, 3), 0.4, np.float32)
     light[3, 20] = 60.0
-    places = {3: similarity(np.eye(3), np.array([1.2, 0, 0])), 7: similarity(np.eye(3), np.array([0, 0, 0.1]))}
+    places = {
+        3: similarity(np.eye(3), np.array([1.2, 0, 0])),
+        7: similarity(np.eye(3), np.array([0, 0, 0.1])),
+    }
     eye = np.array([0.3, 0.8, 2.2])
-    camera = Camera(SIZE, SIZE, 1.6 * SIZE, 1.6 * SIZE, SIZE / 2, SIZE / 2, look_at(eye, np.array([0, 0, 0.1]), np.array([0, 1.0, 0])))
+    camera = Camera(
+        SIZE,
+        SIZE,
+        1.6 * SIZE,
+        1.6 * SIZE,
+        SIZE / 2,
+        SIZE / 2,
+        look_at(eye, np.array([0, 0, 0.1]), np.array([0, 1.0, 0])),
+    )
     instances = tuple(Instance(k, place) for k, place in places.items())
     material = Material(paint, np.full((64, 64), 0.25, np.float32), np.zeros((64, 64), np.float32))
-    asset = Asset(mesh, material, places[3], light, (("photo", camera),), {}, None, instances=instances)
+    asset = Asset(
+        mesh, material, places[3], light, (("photo", camera),), {}, None, instances=instances
+    )
     picture = as_photographed(asset)("photo", camera, spp=64)
     own = as_photographed(replace(asset, instances=instances[1:]))("photo", camera, spp=16)[..., 3]
-    view = View(7, camera.with_pose(np.eye(4)), picture[..., :3], (own > 0.5).astype(np.float32), np.ones((SIZE, SIZE), np.float32), 1.0)
+    view = View(
+        7,
+        camera.with_pose(np.eye(4)),
+        picture[..., :3],
+        (own > 0.5).astype(np.float32),
+        np.ones((SIZE, SIZE), np.float32),
+        1.0,
+    )
     return asset, camera, view, np.linalg.inv(places[7])
 
 
@@ -49,12 +70,16 @@ def test_the_turn_that_looks_like_the_photo_is_found(photographed, angle):
     seen = []
     found = turned_as_shown(begun, [view], [camera], guess[None], AXIS, progress=seen.append)
     assert rotation_angle(found[0][:3, :3] @ pose[:3, :3].T) < 3.0
-    assert np.allclose(found[0] @ np.array([0, 0.2, 0.1, 1]), pose @ np.array([0, 0.2, 0.1, 1]), atol=1e-6)  # the axis stays where it is
+    assert np.allclose(
+        found[0] @ np.array([0, 0.2, 0.1, 1]), pose @ np.array([0, 0.2, 0.1, 1]), atol=1e-6
+    )  # the axis stays where it is
     assert seen == list(range(1, module.SCENES + 1))
     assert begun.instances[0].world_from_object is asset.instances[0].world_from_object
 
 
-def test_only_guessed_instances_are_turned_and_a_rerun_reads_them_back(photographed, tmp_path, monkeypatch):
+def test_only_guessed_instances_are_turned_and_a_rerun_reads_them_back(
+    photographed, tmp_path, monkeypatch
+):
     asset, camera, view, pose = photographed
     guess = turned_by(pose, AXIS, 2.5)
     begun = module.moved(asset, {7: np.linalg.inv(guess) @ pose})
@@ -71,7 +96,9 @@ def test_only_guessed_instances_are_turned_and_a_rerun_reads_them_back(photograp
         assert np.array_equal(poses[0], parts["poses"][0])
         assert rotation_angle(poses[1][:3, :3] @ (pose @ camera.world_from_camera)[:3, :3].T) < 3.0
         monkeypatch.setattr(duplicates, "turned_as_shown", None)
-        assert np.array_equal(duplicates.turns_stage(begun, asset.mesh, views, camera, parts, run, 0), poses)
+        assert np.array_equal(
+            duplicates.turns_stage(begun, asset.mesh, views, camera, parts, run, 0), poses
+        )
 
 
 def test_what_shows_nothing_whole_stays_as_it_is(photographed):
@@ -84,11 +111,15 @@ def test_what_shows_nothing_whole_stays_as_it_is(photographed):
 def test_where_two_turns_look_alike_the_one_it_has_stays(photographed, angle):
     asset, camera, view, pose = photographed
     paint = asset.material.base_color
-    alike = replace(asset, material=replace(asset.material, base_color=(paint + paint[::-1, ::-1]) / 2))
+    alike = replace(
+        asset, material=replace(asset.material, base_color=(paint + paint[::-1, ::-1]) / 2)
+    )
     picture = as_photographed(alike)("photo", camera, spp=64)[..., :3]
     guess = turned_by(pose, AXIS, angle)
     begun = module.moved(alike, {7: np.linalg.inv(guess) @ pose})
-    found = turned_as_shown(begun, [replace(view, rgb=picture * 0.9)], [camera], guess[None], AXIS)  # a light that is somewhat off
+    found = turned_as_shown(
+        begun, [replace(view, rgb=picture * 0.9)], [camera], guess[None], AXIS
+    )  # a light that is somewhat off
     assert rotation_angle(found[0][:3, :3] @ guess[:3, :3].T) < 3.0
 
 

@@ -1,4 +1,5 @@
-"""Photos without masks: the whole scene first, then a shape from its depths, then the volume pass before the fitted background."""
+"""Photos without masks: the whole scene first, then a shape from its depths, then the volume pass
+before the fitted background."""
 
 from dataclasses import replace
 
@@ -8,12 +9,12 @@ from lump import cameras, distance_to_truth, lump, write_cameras
 
 from relit.asset.asset import save_asset
 from relit.asset.gltf import has_border
-from relit.capture import open_capture
+from relit.capture.open import open_capture
 from relit.conventions import environment_directions, move_points, sample_environment
 from relit.evaluate.photos import directions
-from relit.fit.multiview import MultiviewOptions, reconstruct
+from relit.fit.multiview.recipe import MultiviewOptions, reconstruct
 from relit.images import write_linear
-from relit.rendering.mitsuba_scene import build_scene, render
+from relit.reference.mitsuba_scene import build_scene, render
 from relit.run import Run
 from relit.scene import Sphere
 
@@ -35,7 +36,8 @@ OPTIONS = MultiviewOptions(
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """The lump under and before a light with structure. So few photos all around that each sees a patch of background which no other
+    """The lump under and before a light with structure. So few photos all around that each sees a
+    patch of background which no other
     sees: it could explain the photo without any object."""
     folder = tmp_path_factory.mktemp("unmasked")
     mesh, material = lump()

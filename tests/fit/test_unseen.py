@@ -7,12 +7,12 @@ import trimesh
 from lump import cameras, lump
 
 from relit.asset.gltf import has_border
-from relit.cameras.se3 import look_at
-from relit.fit.duplicates import shown_faces
-from relit.fit.unseen import seen_faces, seen_points, without_unseen
+from relit.fit.duplicates.recipe import shown_faces
+from relit.fit.shape.unseen import seen_faces, seen_points, without_unseen
 from relit.geometry.mesh import face_areas
+from relit.geometry.se3 import look_at
 from relit.geometry.tangents import vertex_normals
-from relit.rendering.mitsuba_scene import build_geometry
+from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Mesh
 
 
@@ -21,7 +21,9 @@ def ball(radius=0.6, dent=0.0) -> Mesh:
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=1.0)
     n = np.asarray(sphere.vertices)
     pit = np.exp(-((np.linalg.norm(n - [0, 1, 0], axis=1) / 0.06) ** 2))
-    mesh = Mesh((n * (radius - dent * pit)[:, None]).astype(np.float32), np.asarray(sphere.faces, np.int32))
+    mesh = Mesh(
+        (n * (radius - dent * pit)[:, None]).astype(np.float32), np.asarray(sphere.faces, np.int32)
+    )
     return replace(mesh, normals=vertex_normals(mesh))
 
 
@@ -35,7 +37,8 @@ def test_the_side_that_no_camera_sees_goes():
     assert has_border(kept) and not has_border(mesh)
     assert kept.vertices[:, 1].max() > 0.59
     height = kept.vertices[kept.faces].mean(1)[:, 1]
-    # a camera at distance D sees the cap of a ball of radius r above the plane r^2 / D from its centre
+    # a camera at distance D sees the cap of a ball of radius r above the plane r^2 / D from its
+    # centre
     lowest = min((c.centre / np.linalg.norm(c.centre))[1] for c in views)
     tilt = np.arccos(lowest)
     below = 0.6 * np.cos(tilt + np.arccos(0.6 / 2.1))
@@ -68,7 +71,9 @@ def test_what_stands_behind_another_body_is_not_seen():
     one = ball(0.4)
     far = replace(one, vertices=one.vertices - np.float32([0, 0, 2]))
     faces = np.concatenate([one.faces, far.faces + len(one.vertices)])
-    both = Mesh(np.concatenate([one.vertices, far.vertices]), faces, np.concatenate([one.normals] * 2))
+    both = Mesh(
+        np.concatenate([one.vertices, far.vertices]), faces, np.concatenate([one.normals] * 2)
+    )
     before = cameras()[0].with_pose(look_at(np.array([0.0, 0.0, 2.1])))
     seen = seen_faces(both, [before])
     front = one.vertices[one.faces].mean(1)[:, 2] > 0.2
@@ -87,7 +92,8 @@ def test_aslant_is_seen_by_a_lower_cosine_alone():
 
 
 def test_what_another_instance_hides_of_all_counts_as_unseen():
-    """Two instances, one straight behind the other: of the far one nothing is seen, of the near one its front; the ground counts not."""
+    """Two instances, one straight behind the other: of the far one nothing is seen, of the near one
+    its front; the ground counts not."""
     one = ball(0.6)
     far = one.vertices - np.float32([0, 0, 2])
     square = np.float32([[-9, -0.7, -9], [9, -0.7, -9], [9, -0.7, 9], [-9, -0.7, 9]])
@@ -105,4 +111,6 @@ def test_what_another_instance_hides_of_all_counts_as_unseen():
     assert seen[middle > 0.3].all() and not seen[middle < 0.1].any()
     back = cameras()[0].with_pose(look_at(np.array([0.0, 0.0, -4.1]), np.array([0.0, 0.0, -2.0])))
     assert shown_faces(pile, both, [front, back])[middle < -0.3].all()  # which the far one shows
-    assert not shown_faces(pile, np.array([True, False]), [front, back])[middle < 0.1].any()  # but not where its turn is a guess
+    assert not shown_faces(pile, np.array([True, False]), [front, back])[
+        middle < 0.1
+    ].any()  # but not where its turn is a guess

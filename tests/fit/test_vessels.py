@@ -1,4 +1,5 @@
-"""Ends of bodies of revolution: cut off where no silhouette needs them, and opened where the light says that they are mouths."""
+"""Ends of bodies of revolution: cut off where no silhouette needs them, and opened where the light
+says that they are mouths."""
 
 import json
 from types import SimpleNamespace
@@ -9,25 +10,24 @@ from lathe import BASE, BOTTOM, CUP, FLOOR, PLUG, RIM, TOP, WALL, side, spotted,
 from test_duplicates_recipe import small_options, true_poses
 
 from relit.asset.gltf import write_glb
-from relit.cameras.se3 import look_at
-from relit.capture import open_capture
-from relit.capture.procedural import studio
-from relit.capture.synthetic_duplicates import synthesize_duplicates
+from relit.capture.open import open_capture
 from relit.conventions import scale_of
-from relit.fit import duplicates_shape as shape
-from relit.fit import vessel_trial
-from relit.fit.duplicates_poses import all_views
-from relit.fit.instances import View
-from relit.fit.surface import SurfaceOptions
-from relit.fit.vessel_trial import FLOORS, lowest_of
-from relit.fit.vessels import End, body_axis, ends_of, floor_under, hollowed, mouths
+from relit.fit.duplicates import shape, vessel_trial
+from relit.fit.duplicates.poses import all_views
+from relit.fit.duplicates.vessel_trial import FLOORS, lowest_of
+from relit.fit.duplicates.vessels import End, body_axis, ends_of, floor_under, hollowed, mouths
+from relit.fit.passes.surface import SurfaceOptions
+from relit.fit.registration.instances.views import View
 from relit.geometry.hull import distance_of
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.revolution_axis import Axis, revolution_axis
 from relit.geometry.sdf import node_positions
+from relit.geometry.se3 import look_at
 from relit.images import write_linear
 from relit.run import Run
 from relit.scene import Camera
+from relit.synthesize.duplicates import synthesize_duplicates
+from relit.synthesize.procedural import studio
 
 N = 64
 P = node_positions(N)
@@ -76,12 +76,18 @@ def test_normals_that_meet_a_line_tell_it():
     n = np.stack([np.cos(a), -0.4 * h, np.sin(a)], -1)
     p = np.stack([r * np.cos(a) + 3, h, r * np.sin(a) - 2], -1)
     axis, missed = revolution_axis(p, n / np.linalg.norm(n, axis=1, keepdims=True))
-    assert missed < 1e-6 and axis.radii(np.array([3.0, 7.0, -2.0])) < 1e-6 and abs(axis.direction[1]) > 1 - 1e-9
+    assert (
+        missed < 1e-6
+        and axis.radii(np.array([3.0, 7.0, -2.0])) < 1e-6
+        and abs(axis.direction[1]) > 1 - 1e-9
+    )
 
 
 def test_ends_are_cut_where_silhouettes_let_them_be():
     fine = node_positions(160)
-    plug = (np.abs(fine[..., 1]) < TOP) & (np.hypot(fine[..., 0], fine[..., 2]) < side(fine[..., 1]))
+    plug = (np.abs(fine[..., 1]) < TOP) & (
+        np.hypot(fine[..., 0], fine[..., 2]) < side(fine[..., 1])
+    )
     views, cameras = silhouettes(plug)
     flat, ends = ends_of(coned(), UP, views, cameras)
     top, bottom = ends
@@ -89,9 +95,14 @@ def test_ends_are_cut_where_silhouettes_let_them_be():
     assert (top.sign, bottom.sign) == (1, -1)
     assert abs(top.height - TOP) < 2 * voxel and abs(bottom.height + BOTTOM) < 2 * voxel
     assert abs(top.radius - RIM) < 2 * voxel
-    assert not (flat[P[..., 1] > TOP + 2 * voxel] < 0).any() and (coned()[P[..., 1] > TOP + 2 * voxel] < 0).any()
+    assert (
+        not (flat[P[..., 1] > TOP + 2 * voxel] < 0).any()
+        and (coned()[P[..., 1] > TOP + 2 * voxel] < 0).any()
+    )
     assert [e.sign for e in mouths(flat, UP, ends)] == [1, -1]
-    tip = (np.abs(fine[..., 1]) < TOP) & (np.hypot(fine[..., 0], fine[..., 2]) < 0.6 * (TOP - fine[..., 1]))
+    tip = (np.abs(fine[..., 1]) < TOP) & (
+        np.hypot(fine[..., 0], fine[..., 2]) < 0.6 * (TOP - fine[..., 1])
+    )
     views, cameras = silhouettes(tip, (0.0, 0.2, -0.1))  # from the side a cone is a cone
     y = P[..., 1]
     cone = distance_of((np.abs(y) < TOP) & (np.hypot(P[..., 0], P[..., 2]) < 0.6 * (TOP - y)))
@@ -100,13 +111,18 @@ def test_ends_are_cut_where_silhouettes_let_them_be():
 
 
 def test_a_thin_tip_stays():
-    """Thinner than a voxel in the photos, and a node wide in the body: its silhouette is there all the same."""
+    """Thinner than a voxel in the photos, and a node wide in the body: its silhouette is there all
+    the same."""
     fine = node_positions(160)
     r, y = np.hypot(fine[..., 0], fine[..., 2]), fine[..., 1]
-    views, cameras = silhouettes(((np.abs(y) < TOP) & (r < side(y))) | ((y > 0) & (y < 0.75) & (r < 0.02)))
+    views, cameras = silhouettes(
+        ((np.abs(y) < TOP) & (r < side(y))) | ((y > 0) & (y < 0.75) & (r < 0.02))
+    )
     r, y = np.hypot(P[..., 0], P[..., 2]), P[..., 1]
     body = np.maximum(np.abs(y) - TOP, r - side(y))
-    ends = ends_of(np.minimum(body, np.maximum(np.abs(y - 0.4) - 0.35, r - 0.04)), UP, views, cameras)[1]
+    ends = ends_of(
+        np.minimum(body, np.maximum(np.abs(y - 0.4) - 0.35, r - 0.04)), UP, views, cameras
+    )[1]
     assert ends[0].height > 0.65 and abs(ends[1].height - TOP) < 0.06
 
 
@@ -119,20 +135,33 @@ def test_a_hollow_has_a_wall_and_a_floor():
     body = hollowed(values, flat, UP, end)
     gone = (flat < 0) & (body >= 0)
     middle = np.abs(y) < 0.2
-    assert gone[middle & (r < side(y) - 3.5 * voxel)].all() and not gone[middle & (r > side(y) - voxel)].any()
-    assert not gone[y < BOTTOM + voxel].any() and gone[(y > BOTTOM + 3 * voxel) & (r < 0.2) & (y < TOP - voxel)].all()
+    assert (
+        gone[middle & (r < side(y) - 3.5 * voxel)].all()
+        and not gone[middle & (r > side(y) - voxel)].any()
+    )
+    assert (
+        not gone[y < BOTTOM + voxel].any()
+        and gone[(y > BOTTOM + 3 * voxel) & (r < 0.2) & (y < TOP - voxel)].all()
+    )
     raised = hollowed(values, flat, UP, end, 0.5)
     assert (raised[(y < -2 * voxel) & (r < 0.2) & (y > BOTTOM + voxel)] < 0).all()
     assert abs(floor_under(flat, UP, end) - BOTTOM) < 2 * voxel
     goblet = distance_of(
-        ((y > 0) & (y < TOP) & (r < 0.3 + y)) | ((y <= 0) & (y > -0.4) & (r < 0.1)) | ((np.abs(y + 0.45) < 0.06) & (r < 0.3))
+        ((y > 0) & (y < TOP) & (r < 0.3 + y))
+        | ((y <= 0) & (y > -0.4) & (r < 0.1))
+        | ((np.abs(y + 0.45) < 0.06) & (r < 0.3))
     )
     assert -0.42 < floor_under(goblet, UP, end) < 0.02  # on the stem, not in the foot
     assert hollowed(values, flat, UP, End(1, TOP, RIM), 1.0) is None
-    for end in (End(1, TOP, RIM), End(-1, -BOTTOM, BASE)):  # an end that was flat before can be opened too
+    for end in (
+        End(1, TOP, RIM),
+        End(-1, -BOTTOM, BASE),
+    ):  # an end that was flat before can be opened too
         opened = hollowed(flat, flat, UP, end)
         beside = (r < 0.25) & (np.abs(end.sign * y - end.height + 3 * voxel) < 3 * voxel)
-        assert (opened[beside] > 0).all() and (flat[beside & (end.sign * y < end.height - voxel)] < 0).all()
+        assert (opened[beside] > 0).all() and (
+            flat[beside & (end.sign * y < end.height - voxel)] < 0
+        ).all()
 
 
 def test_floor_is_where_the_error_is_least():
@@ -141,13 +170,23 @@ def test_floor_is_where_the_error_is_least():
 
 
 def asked(folder, profile, monkeypatch):
-    """What the stage makes of the plug with a cone on its mouth, from the true poses of a pile of what the profile tells; the scale of the
-    asset in the unit frame; what was said."""
+    """What the stage makes of the plug with a cone on its mouth, from the true poses of a pile of
+    what the profile tells; the scale of the asset in the unit frame; what was said."""
     folder.mkdir()
     write_glb(folder / "thing.glb", turned(profile), spotted())
     write_linear(folder / "light.exr", studio(32))
-    sizes = {"count": 8, "seed": 1, "resolution": 400, "test_resolution": 16, "spp": 32, "test_spp": 1, "test_views": 1}
-    photo = synthesize_duplicates(folder / "thing.glb", folder / "light.exr", folder / "photo", **sizes)
+    sizes = {
+        "count": 8,
+        "seed": 1,
+        "resolution": 400,
+        "test_resolution": 16,
+        "spp": 32,
+        "test_spp": 1,
+        "test_views": 1,
+    }
+    photo = synthesize_duplicates(
+        folder / "thing.glb", folder / "light.exr", folder / "photo", **sizes
+    )
     truth = json.loads((photo / "truth" / "truth.json").read_text())
     scale = scale_of(np.array(truth["instances"][0]["world_from_object"]))
     options = small_options(levels=(24, N), level_steps=(10, 10), surface_steps=320, points=2048)
@@ -170,13 +209,20 @@ def test_light_tells_a_cup_from_a_plug(tmp_path, monkeypatch):
     r, y = np.hypot(P[..., 0], P[..., 2]) / scale, P[..., 1] / scale
     inside = (y > FLOOR + 0.1) & (y < TOP - 0.05) & (r < side(y) - 2 * WALL)
     assert "hollow under one end" in said and (cup[inside] > 0).mean() > 0.95
-    assert "hollow" not in silent and (plug[(np.hypot(P[..., 0], P[..., 2]) / same < 0.3) & (np.abs(P[..., 1]) / same < 0.25)] < 0).all()
+    assert (
+        "hollow" not in silent
+        and (
+            plug[(np.hypot(P[..., 0], P[..., 2]) / same < 0.3) & (np.abs(P[..., 1]) / same < 0.25)]
+            < 0
+        ).all()
+    )
     for found, s in ((cup, scale), (plug, same)):  # the cone is gone from either
         assert not (found[P[..., 1] / s > TOP + 0.1] < 0).any()
 
 
 def test_the_second_end_is_asked_of_the_fit_with_the_first_hollow(monkeypatch):
-    """A fit takes long: five for two ends, one of them a mouth, and the other one is compared with the likeliest hollow of the first."""
+    """A fit takes long: five for two ends, one of them a mouth, and the other one is compared with
+    the likeliest hollow of the first."""
     fitted, compared = [], []
 
     class Fake(SimpleNamespace):
@@ -195,7 +241,9 @@ def test_the_second_end_is_asked_of_the_fit_with_the_first_hollow(monkeypatch):
         "body_axis": lambda mesh: UP,
         "ends_of": lambda values, *_: (np.full_like(values, 0.0), None),
         "mouths": lambda *_: ["mouth", "foot"],
-        "hollowed": lambda values, shape, axis, end, raised: np.full(values.shape, f"{end} {raised}".startswith("mouth") * (1 + raised)),
+        "hollowed": lambda values, shape, axis, end, raised: np.full(
+            values.shape, f"{end} {raised}".startswith("mouth") * (1 + raised)
+        ),
         "lid_of": lambda *_: None,
         "met_by": lambda *_: vessel_trial.PIXELS,
         "change_of_error": change,
@@ -204,9 +252,18 @@ def test_the_second_end_is_asked_of_the_fit_with_the_first_hollow(monkeypatch):
     for name, by in replaced.items():
         monkeypatch.setattr(vessel_trial, name, by)
     names = iter(["flat", "mouth 0.0", "mouth 0.2", "mouth 0.4", "foot 0.0"])
-    monkeypatch.setattr(vessel_trial.Body, "of", staticmethod(lambda *_: Fake(mesh=None, name=next(names))))
+    monkeypatch.setattr(
+        vessel_trial.Body, "of", staticmethod(lambda *_: Fake(mesh=None, name=next(names)))
+    )
     said = []
-    found = vessel_trial.vessel_of(np.full((2, 2, 2), -1.0), [], [], None, SurfaceOptions(), said.append)
+    found = vessel_trial.vessel_of(
+        np.full((2, 2, 2), -1.0), [], [], None, SurfaceOptions(), said.append
+    )
     assert fitted == ["flat", "mouth 0.0", "mouth 0.2", "mouth 0.4", "foot 0.0"]
-    assert compared == [("flat", "mouth 0.0"), ("flat", "mouth 0.2"), ("flat", "mouth 0.4"), ("mouth 0.2", "foot 0.0")]
+    assert compared == [
+        ("flat", "mouth 0.0"),
+        ("flat", "mouth 0.2"),
+        ("flat", "mouth 0.4"),
+        ("mouth 0.2", "foot 0.0"),
+    ]
     assert len(said) == 1 and np.allclose(found, 1 + lowest_of([0.5, 0.3, 0.6]))

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 from volume_lump import photos_of, volume_lump
 
-from relit.capture.synthetic_collection import roughened
+from relit.synthesize.collection import roughened
 
 LEVELS = {"levels": (24, 48), "steps": (60, 120), "rays": 2048}
 
@@ -17,38 +17,50 @@ def lump():
 
 @pytest.fixture(scope="module")
 def photos(lump):
-    """(rgb, roughened mask, camera) of the lump, from true cameras, each under an exposure and a white of its own."""
+    """(rgb, roughened mask, camera) of the lump, from true cameras, each under an exposure and a
+    white of its own."""
     shots = photos_of(lump, 24, np.random.default_rng(3))
     return [(rgb, roughened(alpha, 3.0, i), camera) for i, (rgb, alpha, camera) in enumerate(shots)]
 
 
 def fitted(photos, **options):
     """The mesh that the volume pass makes of the photos."""
-    from relit.fit.collection_shape import hull_of
-    from relit.fit.loop import NoStage
-    from relit.fit.pixels import make_bank
-    from relit.fit.volume import VolumeOptions, fit_volume, start_model
+    from relit.fit.collection.shape import hull_of
+    from relit.fit.passes.optimiser import NoStage
+    from relit.fit.passes.pixels import make_bank
+    from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
     from relit.geometry.mesh import extract_mesh
     from relit.geometry.sdf import dense_values
-    from relit.rendering.shade_photos import shade_photos, start_photo_lights
+    from relit.rendering.appearance.light_per_photo import shade_photos, start_photo_lights
 
     rgb, masks, cameras = zip(*photos, strict=True)
     tints = np.array([r[m > 0.9].mean(0) for r, m in zip(rgb, masks, strict=True)])
-    model = start_model(hull_of(list(cameras), list(masks), LEVELS["levels"][0]), np.full(3, 0.3), None, full=False)
+    model = start_model(
+        hull_of(list(cameras), list(masks), LEVELS["levels"][0]), np.full(3, 0.3), None, full=False
+    )
     model.reflections, model.rates = start_photo_lights(tints, 0.3)
     model.appearance = shade_photos
-    fit_volume(make_bank(list(cameras), list(rgb), list(masks)), model, VolumeOptions(**LEVELS, **options), NoStage(), 0)
+    fit_volume(
+        make_bank(list(cameras), list(rgb), list(masks)),
+        model,
+        VolumeOptions(**LEVELS, **options),
+        NoStage(),
+        0,
+    )
     return extract_mesh(dense_values(model.grid), faces=8000)
 
 
 def normal_error(mesh, lump) -> float:
-    """Mean angle between the normals of a mesh and those of the lump where it is nearest, degrees."""
+    """Mean angle between the normals of a mesh and those of the lump where it is nearest,
+    degrees."""
     from relit.geometry.mesh import extract_mesh
     from relit.geometry.sdf import dense_values
 
     true = extract_mesh(dense_values(lump.grid), faces=20_000)
     nearest = cKDTree(true.vertices).query(mesh.vertices)[1]
-    return float(np.degrees(np.arccos(np.clip((mesh.normals * true.normals[nearest]).sum(1), -1, 1))).mean())
+    return float(
+        np.degrees(np.arccos(np.clip((mesh.normals * true.normals[nearest]).sum(1), -1, 1))).mean()
+    )
 
 
 def test_masks_that_are_heard_less_in_the_fine_level_leave_a_smoother_surface(photos, lump):
@@ -57,10 +69,12 @@ def test_masks_that_are_heard_less_in_the_fine_level_leave_a_smoother_surface(ph
 
 
 def test_a_weight_is_that_of_its_level_and_the_last_one_of_all_further_levels(photos, monkeypatch):
-    from relit.fit import volume
+    from relit.fit.passes import volume
 
     heard = []
-    monkeypatch.setattr(volume, "_fit_level", lambda bank, model, *a, **k: heard.append((model.grid.n, k["mask"])))
+    monkeypatch.setattr(
+        volume, "_fit_level", lambda bank, model, *a, **k: heard.append((model.grid.n, k["mask"]))
+    )
     monkeypatch.setitem(LEVELS, "levels", (16, 24, 32))
     monkeypatch.setitem(LEVELS, "steps", (1, 1, 1))
     fitted(photos[:6], mask=(0.8, 0.1))
@@ -69,7 +83,7 @@ def test_a_weight_is_that_of_its_level_and_the_last_one_of_all_further_levels(ph
 
 @pytest.mark.parametrize("weights", [(), (0.8, -0.1)])
 def test_senseless_weights_are_refused(weights):
-    from relit.fit.collection_options import CollectionOptions
+    from relit.fit.collection.options import CollectionOptions
 
     with pytest.raises(ValueError, match="mask_weights"):
         CollectionOptions(mask_weights=weights)

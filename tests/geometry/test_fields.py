@@ -6,13 +6,20 @@ import trimesh
 from reference.sdf import eikonal_energy
 
 from relit.errors import UserError
-from relit.fit.volume import next_level, start_model
+from relit.fit.passes.volume import next_level, start_model
 from relit.geometry.atlas import cells, unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.fusion import fuse_depths
 from relit.geometry.hull import distance_of, visual_hull
 from relit.geometry.mesh import extract_mesh
-from relit.geometry.sdf import dense_values, make_grid, node_positions, redistance, resample, smoothness_gradient
+from relit.geometry.sdf import (
+    dense_values,
+    make_grid,
+    node_positions,
+    redistance,
+    resample,
+    smoothness_gradient,
+)
 from relit.scene import Camera
 
 
@@ -38,7 +45,10 @@ def views(count=16, size=64, distance=2.5):
 
 
 def ray_grid(camera):
-    u, v = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy)
+    u, v = np.meshgrid(
+        (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
+        (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
+    )
     d = np.stack([u, v, np.ones_like(u)], -1)
     return (d / np.linalg.norm(d, axis=-1, keepdims=True)) @ camera.world_from_camera[:3, :3].T
 
@@ -81,7 +91,9 @@ def test_resample_is_exact_for_linear_fields():
     p = node_positions(9)
     field = 0.3 * p[..., 0] - 0.2 * p[..., 1] + 0.7 * p[..., 2]
     q = node_positions(17)
-    np.testing.assert_allclose(resample(field, 17), 0.3 * q[..., 0] - 0.2 * q[..., 1] + 0.7 * q[..., 2], atol=1e-5)
+    np.testing.assert_allclose(
+        resample(field, 17), 0.3 * q[..., 0] - 0.2 * q[..., 1] + 0.7 * q[..., 2], atol=1e-5
+    )
 
 
 def test_eikonal_gradient_against_finite_differences():
@@ -93,7 +105,12 @@ def test_eikonal_gradient_against_finite_differences():
     grid = make_grid(values, 4, band=np.inf)
     slope = np.array(smoothness_gradient(grid, dr.opaque(mi.Float, 1.0))[0])[1:]
     direction = np.sign(slope).reshape(12, 12, 12)
-    energy = [eikonal_energy(make_grid((values + s * 1e-3 * direction).astype(np.float32), 4, band=np.inf)) for s in (1, -1)]
+    energy = [
+        eikonal_energy(
+            make_grid((values + s * 1e-3 * direction).astype(np.float32), 4, band=np.inf)
+        )
+        for s in (1, -1)
+    ]
     numeric, analytic = (energy[0] - energy[1]) / 2e-3, np.abs(slope).sum()
     assert abs(numeric - analytic) < 0.02 * numeric
     assert dense_values(grid).shape == (12, 12, 12)
@@ -110,12 +127,24 @@ def test_eikonal_gradient_of_a_narrow_band(band):
     grid = make_grid(values, 4, band=band)
     inside = np.isin(np.arange(n**3), np.array(grid.nodes)).reshape(n, n, n)
     inner = inside & (np.pad(np.ones((n - 2,) * 3), 1) > 0)
-    steps = [(np.roll(values, -1, axis) - np.roll(values, 1, axis)) / (2 * grid.h) for axis in range(3)]
-    weight = 2 / inside.sum() * (1 - 1 / np.maximum(np.sqrt(sum(s**2 for s in steps)), 0.05)) * inner / (2 * grid.h)
-    expected = sum(np.roll(weight * s, 1, axis) - np.roll(weight * s, -1, axis) for axis, s in enumerate(steps))
+    steps = [
+        (np.roll(values, -1, axis) - np.roll(values, 1, axis)) / (2 * grid.h) for axis in range(3)
+    ]
+    weight = (
+        2
+        / inside.sum()
+        * (1 - 1 / np.maximum(np.sqrt(sum(s**2 for s in steps)), 0.05))
+        * inner
+        / (2 * grid.h)
+    )
+    expected = sum(
+        np.roll(weight * s, 1, axis) - np.roll(weight * s, -1, axis) for axis, s in enumerate(steps)
+    )
     slope = np.array(smoothness_gradient(grid, dr.opaque(mi.Float, 1.0))[0])
     assert slope[0] == 0
-    np.testing.assert_allclose(slope[1:], expected.ravel()[np.array(grid.nodes)], atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        slope[1:], expected.ravel()[np.array(grid.nodes)], atol=1e-5 * np.abs(expected).max()
+    )
 
 
 def test_fused_depths_give_the_ball_back():
@@ -139,9 +168,13 @@ def test_mesh_of_a_ball():
 
 def test_floaters_are_dropped_and_the_cube_is_closed():
     p = node_positions(40)
-    values = np.minimum(np.linalg.norm(p, axis=-1) - 0.5, np.linalg.norm(p - 0.75, axis=-1) - 0.06).astype(np.float32)
+    values = np.minimum(
+        np.linalg.norm(p, axis=-1) - 0.5, np.linalg.norm(p - 0.75, axis=-1) - 0.06
+    ).astype(np.float32)
     assert np.linalg.norm(extract_mesh(values).vertices, axis=1).max() < 0.6
-    assert trimesh.Trimesh(*[getattr(extract_mesh(ball(24, 1.2)), k) for k in ("vertices", "faces")]).is_watertight
+    assert trimesh.Trimesh(
+        *[getattr(extract_mesh(ball(24, 1.2)), k) for k in ("vertices", "faces")]
+    ).is_watertight
 
 
 def test_no_surface_is_an_error():
@@ -161,8 +194,15 @@ def test_atlas(how):
     assert len(mesh.faces) == len(plain.faces)
     assert mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
     face, bary = rasterise_atlas(mesh, 256)
-    area = 0.5 * np.abs(np.cross(*[mesh.uvs[mesh.faces[:, k]] - mesh.uvs[mesh.faces[:, 0]] for k in (1, 2)])).sum()
-    assert abs((face >= 0).mean() - area) < 0.25 * area  # overlapping faces would cover less than the sum of their areas
+    area = (
+        0.5
+        * np.abs(
+            np.cross(*[mesh.uvs[mesh.faces[:, k]] - mesh.uvs[mesh.faces[:, 0]] for k in (1, 2)])
+        ).sum()
+    )
+    assert (
+        abs((face >= 0).mean() - area) < 0.25 * area
+    )  # overlapping faces would cover less than the sum of their areas
     positions = interpolate(mesh.vertices, mesh.faces, face, bary)
     r = np.linalg.norm(positions[face >= 0], axis=-1)
     assert np.abs(r - 0.6).max() < 0.05
@@ -185,10 +225,17 @@ def test_gutters_take_the_nearest_value():
 def test_the_second_level_begins_with_what_is_mended():
     p = node_positions(64)
     hollow = distance_of(np.linalg.norm(p - [0, 0, 0.3], axis=-1) < 0.2)
-    model = start_model(np.linalg.norm(node_positions(24), axis=-1).astype(np.float32) - 0.3, np.full(3, 0.5), None, full=False)
+    model = start_model(
+        np.linalg.norm(node_positions(24), axis=-1).astype(np.float32) - 0.3,
+        np.full(3, 0.5),
+        None,
+        full=False,
+    )
     next_level(model, 64, 5.0, lambda values: np.maximum(values, -hollow))
     values = dense_values(model.grid)
     inside = (np.linalg.norm(p, axis=-1) < 0.27) & (hollow > 0.03)
     assert (values < 0)[inside].all() and (values >= 0)[hollow < 0].all()
     rim = (np.linalg.norm(p, axis=-1) < 0.3) & (np.abs(hollow) < 0.02)
-    assert (np.array(model.grid.index).reshape(values.shape) > 0)[rim].all()  # and it is optimised there
+    assert (np.array(model.grid.index).reshape(values.shape) > 0)[
+        rim
+    ].all()  # and it is optimised there

@@ -12,11 +12,14 @@ from relit.geometry.sdf import node_positions, redistance
 
 N = 64
 STEP = 2 / (N - 1)
-AXIS = Axis(np.array([0.02, 0, -0.01]), np.array([0.1, 0.99, 0.05]) / np.linalg.norm([0.1, 0.99, 0.05]))
+AXIS = Axis(
+    np.array([0.02, 0, -0.01]), np.array([0.1, 0.99, 0.05]) / np.linalg.norm([0.1, 0.99, 0.05])
+)
 
 
 def lathe(bumps=lambda turn, height: 0 * turn, extra=None):
-    """A rounded cylinder of radius .35 about AXIS with a waist, its radius changed by bumps(turn, height); extra: distances of more."""
+    """A rounded cylinder of radius .35 about AXIS with a waist, its radius changed by bumps(turn,
+    height); extra: distances of more."""
     p = node_positions(N).astype(np.float64)
     height, radius = AXIS.heights(p), AXIS.radii(p)
     across = np.linalg.svd(AXIS.direction[None])[2][1:]
@@ -27,7 +30,8 @@ def lathe(bumps=lambda turn, height: 0 * turn, extra=None):
 
 
 def off(mesh, sides=0.5):
-    """(of the vertices on the side: by how much the radius is off, their angles to the true normals in degrees)"""
+    """(of the vertices on the side: by how much the radius is off, their angles to the true normals
+    in degrees)"""
     height, radius = AXIS.heights(mesh.vertices), AXIS.radii(mesh.vertices)
     side = (np.abs(height) < sides) & (radius > 0.2)
     away = mesh.vertices - AXIS.point - height[:, None] * AXIS.direction
@@ -68,7 +72,9 @@ def test_a_window_stays():
     before = off(mesh, 0.2)[0]
     inside = before < -2 * STEP
     assert inside.sum() > 100
-    assert np.median(away[inside]) == pytest.approx(-deep, abs=0.3 * STEP) and np.median(away[~inside]) == pytest.approx(0, abs=0.1 * STEP)
+    assert np.median(away[inside]) == pytest.approx(-deep, abs=0.3 * STEP) and np.median(
+        away[~inside]
+    ) == pytest.approx(0, abs=0.1 * STEP)
 
 
 def test_an_oval_stays():
@@ -79,7 +85,10 @@ def test_an_oval_stays():
 
 def test_an_axis_that_is_off_is_found():
     lean = np.cross(AXIS.direction, [0, 0, 1.0]) * 0.02
-    wrong = Axis(AXIS.point + np.array([0.006, 0, 0.004]), (AXIS.direction + lean) / np.linalg.norm(AXIS.direction + lean))
+    wrong = Axis(
+        AXIS.point + np.array([0.006, 0, 0.004]),
+        (AXIS.direction + lean) / np.linalg.norm(AXIS.direction + lean),
+    )
     mesh = lathe(lambda turn, height: 0.004 * np.sin(9 * turn + 7 * height))
     found = wrong
     for _ in range(3):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from relit.cameras.se3 import exp_so3
 from relit.conventions import move_points, similarity
+from relit.geometry.se3 import exp_so3
 from relit.geometry.symmetry import Plane, half_sphere, plane_between, symmetry_plane
 
 
@@ -33,7 +33,9 @@ def test_the_plane_is_found_wherever_the_body_lies():
     plane, distance = symmetry_plane(move_points(pose, surface(EVEN)))
     normal = pose[:3, 0]
     assert abs(plane.normal @ normal) > np.cos(np.radians(0.5))
-    assert plane.offset * np.sign(plane.normal @ normal) == pytest.approx(normal @ pose[:3, 3], abs=0.004)
+    assert plane.offset * np.sign(plane.normal @ normal) == pytest.approx(
+        normal @ pose[:3, 3], abs=0.004
+    )
     assert distance < 0.012  # points lie so far apart
     assert symmetry_plane(surface(LOPSIDED))[1] > 2 * distance
 
@@ -45,5 +47,7 @@ def test_the_plane_between_points_and_their_images_is_the_one_that_mirrored_them
         points = rng.standard_normal((40, 3))
         found = plane_between(points, move_points(plane.mirror, points))
         side = np.sign(found.normal @ normal)
-        assert np.allclose(side * found.normal, normal) and side * found.offset == pytest.approx(0.3)
+        assert np.allclose(side * found.normal, normal) and side * found.offset == pytest.approx(
+            0.3
+        )
         assert np.allclose(plane.mirror @ plane.mirror, np.eye(4))

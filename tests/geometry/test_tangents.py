@@ -13,7 +13,9 @@ def cylinder(mirrored: bool, columns=24) -> Mesh:
     phi = 2 * np.pi * u
     points = np.stack([np.sin(phi), 1 - 2 * v, np.cos(phi)], -1).reshape(-1, 3)
     index = np.arange(v.size).reshape(v.shape)
-    a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    a, b, c, d = (
+        i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+    )
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     uvs = np.stack([1 - u if mirrored else u, v], -1).reshape(-1, 2)
     return Mesh(points.astype(np.float32), faces.astype(np.int32), None, uvs.astype(np.float32))

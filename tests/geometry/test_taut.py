@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.cameras.se3 import look_at
 from relit.geometry.hull import NoShape, visual_hull
 from relit.geometry.sdf import node_positions
+from relit.geometry.se3 import look_at
 from relit.geometry.taut import taut
 from relit.scene import Camera
 
@@ -27,7 +27,9 @@ def covered(points, camera):
     q = camera.project(points)
     shape = (camera.height, camera.width)
     out = np.zeros(shape, np.float32)
-    out[np.clip(q[:, 1].astype(int), 0, shape[0] - 1), np.clip(q[:, 0].astype(int), 0, shape[1] - 1)] = 1
+    out[
+        np.clip(q[:, 1].astype(int), 0, shape[0] - 1), np.clip(q[:, 0].astype(int), 0, shape[1] - 1)
+    ] = 1
     return out
 
 
@@ -41,7 +43,9 @@ def cross(p):
 
 
 def hull_and_masks(inside, cameras):
-    masks = [cv2.morphologyEx(picture(inside, c), cv2.MORPH_CLOSE, np.ones((5, 5))) for c in cameras]
+    masks = [
+        cv2.morphologyEx(picture(inside, c), cv2.MORPH_CLOSE, np.ones((5, 5))) for c in cameras
+    ]
     return visual_hull(cameras, masks, NODES), masks
 
 
@@ -82,4 +86,8 @@ def test_what_is_not_known_to_be_the_objects_is_not_held():
 
 def test_an_empty_hull_is_said():
     with pytest.raises(NoShape):
-        taut(np.ones((NODES, NODES, NODES), np.float32), cameras_at((0, 0, 4)), [np.ones((120, 120), np.float32)])
+        taut(
+            np.ones((NODES, NODES, NODES), np.float32),
+            cameras_at((0, 0, 4)),
+            [np.ones((120, 120), np.float32)],
+        )

@@ -1,4 +1,5 @@
-"""Neural-PIL's light network: reading, derivatives, refusals. It is not ours to ship: a random one of its shape stands in."""
+"""Neural-PIL's light network: reading, derivatives, refusals. It is not ours to ship: a random one
+of its shape stands in."""
 
 from pathlib import Path
 
@@ -10,15 +11,25 @@ from relit.lighting.neural_pil import CODE, SHAPES, load_neural_pil
 from relit.lighting.per_photo import COLUMNS, ROWS, TEXELS, log_lights, mean_level
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "weights" / "neural_pil"
-REAL = REAL if REAL.is_dir() else Path(__file__).parents[3] / "shared" / "data" / "weights" / "neural_pil"
+REAL = (
+    REAL
+    if REAL.is_dir()
+    else Path(__file__).parents[3] / "shared" / "data" / "weights" / "neural_pil"
+)
 
 
 def write_network(folder, shapes=SHAPES, seed=0):
     rng = np.random.default_rng(seed)
-    arrays = {f"w{i:02d}": (rng.normal(size=s) / np.sqrt(s[0])).astype(np.float32) for i, s in enumerate(shapes)}
+    arrays = {
+        f"w{i:02d}": (rng.normal(size=s) / np.sqrt(s[0])).astype(np.float32)
+        for i, s in enumerate(shapes)
+    }
     arrays["w09"] = np.ones(3, np.float32)
     np.savez(folder / "illumination-network_network.npz", **arrays)
-    np.save(folder / "illumination_latent_mean_std.npy", np.stack([np.zeros(CODE), np.ones(CODE)]).astype(np.float32))
+    np.save(
+        folder / "illumination_latent_mean_std.npy",
+        np.stack([np.zeros(CODE), np.ones(CODE)]).astype(np.float32),
+    )
 
 
 def test_lights_and_their_derivative(tmp_path):
@@ -30,13 +41,22 @@ def test_lights_and_their_derivative(tmp_path):
     assert maps.shape == (2, TEXELS * 3) and np.isfinite(maps).all()
     assert np.abs(maps[0] - maps[1]).mean() > 0.05
     step = 2e-3
-    sums = [(network.log_maps(noise + s * step * along).astype(np.float64) * gradient).sum(1) for s in (1, -1)]
+    sums = [
+        (network.log_maps(noise + s * step * along).astype(np.float64) * gradient).sum(1)
+        for s in (1, -1)
+    ]
     expected = (sums[0] - sums[1]) / (2 * step)
-    assert np.allclose((network.pull_back(noise, gradient) * along).sum(1), expected, rtol=0.05, atol=0.05 * np.abs(expected).max())
+    assert np.allclose(
+        (network.pull_back(noise, gradient) * along).sum(1),
+        expected,
+        rtol=0.05,
+        atol=0.05 * np.abs(expected).max(),
+    )
 
 
 def test_a_file_as_numpy_names_its_arrays(tmp_path):
-    """`numpy.savez("network.npz", *arrays)`, as the guide says: arr_10 comes after arr_9, not after arr_1."""
+    """`numpy.savez("network.npz", *arrays)`, as the guide says: arr_10 comes after arr_9, not after
+    arr_1."""
     write_network(tmp_path)
     padded = load_neural_pil(tmp_path)
     (tmp_path / "illumination-network_network.npz").unlink()
@@ -56,10 +76,14 @@ def test_gains_come_on_top(tmp_path):
     network = load_neural_pil(tmp_path)
     none = np.zeros((1, CODE), np.float32)
     brighter = log_lights(none, np.full((1, 3), np.log(2)), network)
-    assert np.allclose(np.exp(brighter).reshape(TEXELS, 3).mean(0), 2 * mean_level(network), rtol=1e-3)
+    assert np.allclose(
+        np.exp(brighter).reshape(TEXELS, 3).mean(0), 2 * mean_level(network), rtol=1e-3
+    )
 
 
-@pytest.mark.parametrize("wrong", ["nowhere", "empty", "pickled", "shape", "codes", "no codes", "object array"])
+@pytest.mark.parametrize(
+    "wrong", ["nowhere", "empty", "pickled", "shape", "codes", "no codes", "object array"]
+)
 def test_what_is_no_network_is_refused(tmp_path, wrong):
     folder = tmp_path / "network"
     if wrong != "nowhere":
@@ -67,7 +91,11 @@ def test_what_is_no_network_is_refused(tmp_path, wrong):
     if wrong in ("shape", "codes", "no codes"):
         write_network(folder, (*SHAPES[:-1], (7,)) if wrong == "shape" else SHAPES)
     if wrong == "pickled":
-        np.save(folder / "network.npy", np.array([np.zeros(3), np.zeros(4)], dtype=object), allow_pickle=True)
+        np.save(
+            folder / "network.npy",
+            np.array([np.zeros(3), np.zeros(4)], dtype=object),
+            allow_pickle=True,
+        )
     if wrong == "object array":
         np.savez(folder / "network.npz", a=np.array([np.zeros(3), "x"], dtype=object))
     if wrong == "codes":
@@ -86,4 +114,6 @@ def test_the_real_network_draws_skies():
     noise = np.random.default_rng(0).normal(size=(40, CODE)).astype(np.float32)
     maps = np.exp(network.log_maps(noise)).reshape(-1, ROWS, COLUMNS, 3)
     assert np.median(maps.max((1, 2, 3)) / maps.mean((1, 2, 3))) > 8  # lamps, not mush
-    assert np.median(maps[:, : ROWS // 2].mean((1, 2, 3)) / maps[:, ROWS // 2 :].mean((1, 2, 3))) > 1.1  # light comes from above
+    assert (
+        np.median(maps[:, : ROWS // 2].mean((1, 2, 3)) / maps[:, ROWS // 2 :].mean((1, 2, 3))) > 1.1
+    )  # light comes from above

@@ -9,7 +9,14 @@ def lights(count=3):
 
     rng = np.random.default_rng(0)
     k = light_prior()[1].shape[0]
-    return PhotoLights(mi.Float(np.exp(log_lights(rng.normal(size=(count, k)), rng.normal(size=(count, 3)) * 0.3)).ravel()), count)
+    return PhotoLights(
+        mi.Float(
+            np.exp(
+                log_lights(rng.normal(size=(count, k)), rng.normal(size=(count, 3)) * 0.3)
+            ).ravel()
+        ),
+        count,
+    )
 
 
 def directions(count):
@@ -30,10 +37,15 @@ def test_each_lane_sees_its_own_light():
 
 
 def test_sampling_agrees_with_its_density():
-    """The mean of 1 / pdf over samples is the sphere's area, and the mean of f / pdf the integral of f, light by light."""
+    """The mean of 1 / pdf over samples is the sphere's area, and the mean of f / pdf the integral
+    of f, light by light."""
     import drjit as dr
 
-    from relit.conventions import environment_directions, environment_solid_angles, sample_environment
+    from relit.conventions import (
+        environment_directions,
+        environment_solid_angles,
+        sample_environment,
+    )
     from relit.lighting.per_photo import COLUMNS, ROWS
 
     maps, n = lights(), 60_000
@@ -46,7 +58,10 @@ def test_sampling_agrees_with_its_density():
     fine = environment_directions(8 * ROWS, 8 * COLUMNS)
     area = environment_solid_angles(8 * ROWS, 8 * COLUMNS)[..., None]
     for k in range(3):
-        integral = float((sample_environment(maps.images()[k], fine) * area).sum((0, 1)) @ np.array([0.2126, 0.7152, 0.0722]))
+        integral = float(
+            (sample_environment(maps.images()[k], fine) * area).sum((0, 1))
+            @ np.array([0.2126, 0.7152, 0.0722])
+        )
         own = value[k::3]
         assert abs(own.mean() - integral) < 4 * own.std() / np.sqrt(len(own)) + 0.01 * integral
 
@@ -55,15 +70,21 @@ def test_the_prior_knows_what_is_up():
     from relit.lighting.per_photo import COLUMNS, ROWS, light_prior
 
     mean, basis = light_prior()
-    sky, ground = mean.reshape(ROWS, COLUMNS, 3)[: ROWS // 2].mean(), mean.reshape(ROWS, COLUMNS, 3)[ROWS // 2 :].mean()
+    sky, ground = (
+        mean.reshape(ROWS, COLUMNS, 3)[: ROWS // 2].mean(),
+        mean.reshape(ROWS, COLUMNS, 3)[ROWS // 2 :].mean(),
+    )
     assert sky > ground
     assert np.isfinite(basis).all() and basis.shape[1] == ROWS * COLUMNS * 3
     turned = mean.reshape(ROWS, COLUMNS, 3)
-    assert np.abs(turned - turned.mean(1, keepdims=True)).max() < 2e-2  # learnt under all turns: the mean has no azimuth
+    assert (
+        np.abs(turned - turned.mean(1, keepdims=True)).max() < 2e-2
+    )  # learnt under all turns: the mean has no azimuth
 
 
 def test_the_shipped_light_comes_from_above():
-    """Irradiance of the middle light on what faces up, aside and down: a ground of ordinary reflectance sends back a fifth to a half."""
+    """Irradiance of the middle light on what faces up, aside and down: a ground of ordinary
+    reflectance sends back a fifth to a half."""
     from relit.conventions import environment_directions, environment_solid_angles
     from relit.lighting.per_photo import COLUMNS, ROWS, light_prior
 
@@ -71,6 +92,14 @@ def test_the_shipped_light_comes_from_above():
     radiance = np.exp(mean).reshape(-1, 3)
     directions = environment_directions(ROWS, COLUMNS).reshape(-1, 3)
     angles = environment_solid_angles(ROWS, COLUMNS).ravel()
-    up, aside, down = ((np.maximum(directions @ np.array(n), 0) * angles) @ radiance for n in ([0, 1.0, 0], [1.0, 0, 0], [0, -1.0, 0]))
-    assert (up > 1.5 * aside).all() and (aside > 1.2 * down).all() and (0.2 * up < down).all() and (down < 0.5 * up).all()
+    up, aside, down = (
+        (np.maximum(directions @ np.array(n), 0) * angles) @ radiance
+        for n in ([0, 1.0, 0], [1.0, 0, 0], [0, -1.0, 0])
+    )
+    assert (
+        (up > 1.5 * aside).all()
+        and (aside > 1.2 * down).all()
+        and (0.2 * up < down).all()
+        and (down < 0.5 * up).all()
+    )
     assert basis.shape[0] >= 64

@@ -22,7 +22,9 @@ from relit.lighting.spherical_gaussians import (
 
 def some(count=6, seed=0):
     rng = np.random.default_rng(seed)
-    return SphericalGaussians(fibonacci(count), rng.uniform(2, 60, count), rng.uniform(0.1, 5, (count, 3)))
+    return SphericalGaussians(
+        fibonacci(count), rng.uniform(2, 60, count), rng.uniform(0.1, 5, (count, 3))
+    )
 
 
 def energy_of_map(image):
@@ -44,7 +46,9 @@ def test_one_lobe_is_the_formula():
 
 @pytest.mark.parametrize("sharpness", [0.5, 20.0, 3000.0])
 def test_energy_is_the_integral(sharpness):
-    sg = SphericalGaussians(np.array([[0.6, 0, 0.8]]), np.array([sharpness]), np.array([[1.0, 2, 3]]))
+    sg = SphericalGaussians(
+        np.array([[0.6, 0, 0.8]]), np.array([sharpness]), np.array([[1.0, 2, 3]])
+    )
     assert np.allclose(energy_of_map(environment_of(sg, 64, 128)), energy(sg), rtol=5e-3)
 
 
@@ -73,7 +77,9 @@ def test_energy_and_irradiance_are_kept_with_a_sun_in_the_sky():
 
 def test_large_and_odd_maps_keep_their_energy():
     image = np.random.default_rng(2).random((150, 301, 3)).astype(np.float32)
-    assert np.allclose(energy(fit_spherical_gaussians(image, 16, steps=5)), energy_of_map(image), rtol=1e-4)
+    assert np.allclose(
+        energy(fit_spherical_gaussians(image, 16, steps=5)), energy_of_map(image), rtol=1e-4
+    )
 
 
 def test_black_map_and_one_colour():
@@ -108,7 +114,9 @@ def test_file_round_trip(tmp_path):
         '{"lobes": [{"axis": [0, 0], "sharpness": 1, "amplitude": [1, 1, 1]}]}',
         '{"lobes": [{"axis": [0, 0, 0], "sharpness": 1, "amplitude": [1, 1, 1]}]}',
         '{"lobes": [{"axis": [0, 0, 1], "sharpness": -1, "amplitude": [1, 1, 1]}]}',
-        json.dumps({"lobes": [{"axis": [0, 0, 1], "sharpness": 1, "amplitude": [1, 1, float("nan")]}]}),
+        json.dumps(
+            {"lobes": [{"axis": [0, 0, 1], "sharpness": 1, "amplitude": [1, 1, float("nan")]}]}
+        ),
     ],
 )
 def test_bad_files_get_an_answer(tmp_path, text):

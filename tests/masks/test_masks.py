@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from relit.cameras.se3 import look_at
 from relit.errors import EXIT_ENVIRONMENT, UserError
+from relit.geometry.se3 import look_at
 from relit.masks import files, segment
 from relit.masks.grabcut import grabcut, sphere_disc
 from relit.masks.threshold import find_backdrop
@@ -22,7 +22,9 @@ def disc(h=60, w=80, centre=(30, 40), radius=16):
 
 def photo(mask, background, noise=0.004, colour=(0.4, 0.3, 0.1)):
     shade = 0.4 + 0.6 * np.linspace(0, 1, mask.shape[1])[None, :, None]
-    rgb = mask[..., None] * np.asarray(colour) * shade + (1 - mask[..., None]) * np.asarray(background)
+    rgb = mask[..., None] * np.asarray(colour) * shade + (1 - mask[..., None]) * np.asarray(
+        background
+    )
     return np.maximum(rgb + RNG.normal(size=rgb.shape) * noise, 0).astype(np.float32)
 
 
@@ -30,7 +32,10 @@ def overlap(a, b):
     return float(((a > 0.5) & (b > 0.5)).sum() / ((a > 0.5) | (b > 0.5)).sum())
 
 
-@pytest.mark.parametrize("background, dark", [((0.001, 0.001, 0.001), True), ((0.9, 0.9, 0.88), False), ((0.05, 0.4, 0.1), False)])
+@pytest.mark.parametrize(
+    "background, dark",
+    [((0.001, 0.001, 0.001), True), ((0.9, 0.9, 0.88), False), ((0.05, 0.4, 0.1), False)],
+)
 def test_plain_backdrops(background, dark):
     masks = [disc(centre=(28 + i, 36 + 2 * i)) for i in range(5)]
     photos = [photo(m, background, noise=0.0005) for m in masks]
@@ -60,7 +65,9 @@ def test_the_opening_of_a_ring_stays_open_and_a_small_shadow_is_filled():
 def test_the_disc_of_the_sphere():
     camera = Camera(80, 60, 90.0, 90.0, 40.0, 30.0, look_at([0, 0, -5], [0, 0, 0]))
     seen = sphere_disc(camera, Sphere(np.zeros(3), 1.0))
-    assert seen.sum() == pytest.approx(np.pi * (90 / np.sqrt(24)) ** 2, rel=0.02)  # tangent cone: r / sqrt(d^2 - r^2)
+    assert seen.sum() == pytest.approx(
+        np.pi * (90 / np.sqrt(24)) ** 2, rel=0.02
+    )  # tangent cone: r / sqrt(d^2 - r^2)
     assert not sphere_disc(camera, Sphere(np.array([0, 0, -10.0]), 1.0)).any()  # behind
 
 
@@ -84,7 +91,8 @@ def test_inverted_masks_are_seen():
 
 @pytest.mark.parametrize("suffix, top", [(".png", 255), (".tif", 65535)])
 def test_numbers_0_and_1_are_a_mask(tmp_path, suffix, top):
-    """As programs write that number objects; nearly black both. Black with noise, or a third level, is none."""
+    """As programs write that number objects; nearly black both. Black with noise, or a third level,
+    is none."""
     path, inside = tmp_path / f"a{suffix}", disc() > 0.5
     codes = inside.astype(np.uint8 if top == 255 else np.uint16)
     Image.fromarray(codes).save(path)
@@ -114,9 +122,15 @@ def test_judgement_of_masks():
 @pytest.mark.parametrize(
     "colours, expected",
     [
-        ([(0, 0, 0), (128, 0, 0), (0, 128, 0)], [0, 1, 1]),  # DAVIS, VOC: one dark colour for each object
+        (
+            [(0, 0, 0), (128, 0, 0), (0, 128, 0)],
+            [0, 1, 1],
+        ),  # DAVIS, VOC: one dark colour for each object
         ([(0, 0, 0), (1, 1, 1), (2, 2, 2)], [0, 1, 1]),  # the numbers of the objects as grey levels
-        ([(0, 0, 0), (51, 51, 51), (255, 255, 255)], [0, 0.2, 1]),  # a soft mask with a palette of greys
+        (
+            [(0, 0, 0), (51, 51, 51), (255, 255, 255)],
+            [0, 0.2, 1],
+        ),  # a soft mask with a palette of greys
         ([(255, 255, 255), (0, 0, 0), (51, 51, 51)], [1, 0, 0.2]),  # in another order
     ],
 )
@@ -126,7 +140,9 @@ def test_masks_with_a_palette(tmp_path, colours, expected):
     picture = Image.fromarray(index, "P")
     picture.putpalette([v for c in colours for v in c])
     picture.save(tmp_path / "a.png")
-    np.testing.assert_allclose(files.read_mask(tmp_path / "a.png"), np.array(expected)[index], atol=1e-6)
+    np.testing.assert_allclose(
+        files.read_mask(tmp_path / "a.png"), np.array(expected)[index], atol=1e-6
+    )
 
 
 def test_a_missing_segmenter_says_what_to_install(monkeypatch):

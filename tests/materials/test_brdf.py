@@ -1,4 +1,5 @@
-"""The metallic-roughness BRDF against its NumPy twin, integrals, finite differences, and Mitsuba's `principled`."""
+"""The metallic-roughness BRDF against its NumPy twin, integrals, finite differences, and Mitsuba's
+`principled`."""
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +41,11 @@ def viewer(cos):
 
 
 def lobe_energy(cos, roughness):
-    return np.array(brdf.lobe_albedo(mi.Float(np.asarray(cos, np.float32)), mi.Float(np.asarray(roughness, np.float32))))
+    return np.array(
+        brdf.lobe_albedo(
+            mi.Float(np.asarray(cos, np.float32)), mi.Float(np.asarray(roughness, np.float32))
+        )
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -49,7 +54,10 @@ def test_equals_the_twin(seed):
     count = 3000
     base, rough, metal = rng.random((count, 3)), rng.uniform(0.1, 1, count), rng.random(count)
     n = unit(rng.normal(size=(count, 3)))
-    v, l = (unit(n * rng.uniform(0.1, 2, (count, 1)) + unit(rng.normal(size=(count, 3)))) for _ in range(2))
+    v, l = (
+        unit(n * rng.uniform(0.1, 2, (count, 1)) + unit(rng.normal(size=(count, 3))))
+        for _ in range(2)
+    )
     m = brdf.Surface(mi.Color3f(*base.T), mi.Float(rough), mi.Float(metal), mi.Float(0.05))
     got = np.array(brdf.evaluate(m, vectors(n), vectors(v), vectors(l))).T
     want = twin.evaluate(base, rough, metal, 0.05, n, v, l, lobe_energy)
@@ -68,8 +76,9 @@ def test_directional_albedo_table_is_the_integral_of_the_lobe():
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 0.9, 1.0])
 @pytest.mark.parametrize(("cos", "too_much"), [(0.2, 0.25), (0.5, 0.04), (0.9, 0.01)])
 def test_white_furnace(roughness, cos, too_much):
-    """A white metal in a white room is white. A white dielectric returns somewhat too much towards the rim, as glTF's own model does:
-    its Lambertian part is weighted with 1 - F(v.h) instead of what the lobe leaves over."""
+    """A white metal in a white room is white. A white dielectric returns somewhat too much towards
+    the rim, as glTF's own model does: its Lambertian part is weighted with 1 - F(v.h) instead of
+    what the lobe leaves over."""
     l = hemisphere(400)
     for metallic, low, high in [(1.0, 0.985, 1.01), (0.0, 0.96, 1 + too_much)]:
         m = surface((1, 1, 1), roughness, metallic)
@@ -78,7 +87,8 @@ def test_white_furnace(roughness, cos, too_much):
 
 
 def test_reciprocity_of_the_single_scattering_lobe():
-    """The compensation of Turquin 2019 is one-sided by construction; what it multiplies is symmetric."""
+    """The compensation of Turquin 2019 is one-sided by construction; what it multiplies is
+    symmetric."""
     rng = np.random.default_rng(3)
     v, l = (unit(rng.normal(size=(500, 3)) + np.array([0, 0, 1.2])) for _ in range(2))
     up = (v[:, 2] > 0.05) & (l[:, 2] > 0.05)
@@ -116,9 +126,17 @@ def test_samples_follow_the_density(base, roughness, metallic, cos):
     l = np.array(frame.to_local(brdf.sample(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2])))).T
     phi = np.mod(np.arctan2(l[:, 1], l[:, 0]) / (2 * np.pi), 1)
     seen, _, _ = np.histogram2d(l[:, 2], phi, bins=(rows, columns), range=((0, 1), (0, 1)))
-    z, p = np.meshgrid((np.arange(rows * fine) + 0.5) / (rows * fine), (np.arange(columns * fine) + 0.5) / (columns * fine), indexing="ij")
+    z, p = np.meshgrid(
+        (np.arange(rows * fine) + 0.5) / (rows * fine),
+        (np.arange(columns * fine) + 0.5) / (columns * fine),
+        indexing="ij",
+    )
     s = np.sqrt(1 - z**2)
-    grid = frame.to_world(vectors(np.stack([s * np.cos(2 * np.pi * p), s * np.sin(2 * np.pi * p), z], -1).reshape(-1, 3)))
+    grid = frame.to_world(
+        vectors(
+            np.stack([s * np.cos(2 * np.pi * p), s * np.sin(2 * np.pi * p), z], -1).reshape(-1, 3)
+        )
+    )
     density = np.array(brdf.pdf(m, n, v, grid)).reshape(rows, fine, columns, fine).mean((1, 3))
     expected = density * count * 2 * np.pi / (rows * columns)
     ok = expected > 5
@@ -129,7 +147,8 @@ def test_samples_follow_the_density(base, roughness, metallic, cos):
 @pytest.mark.parametrize("roughness", [0.2, 0.6])
 @pytest.mark.parametrize("cos", [-0.3, 0.05, 0.3])
 def test_sampling_is_unbiased(cos, roughness):
-    """E[n.l / p] is pi, also where the lobe is too narrow for a grid and where the interpolated normal looks away from the viewer."""
+    """E[n.l / p] is pi, also where the lobe is too narrow for a grid and where the interpolated
+    normal looks away from the viewer."""
     m, n, v = surface((0.8, 0.4, 0.1), roughness, 0.3), mi.Normal3f(0, 0, 1), vectors(viewer(cos))
     u = np.random.default_rng(2).random((3, 400_000)).astype(np.float32)
     l = brdf.sample(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
@@ -141,7 +160,10 @@ def test_sampling_is_unbiased(cos, roughness):
 
 def test_the_viewer_behind_an_interpolated_normal_is_not_black():
     value = brdf.evaluate(
-        surface((0.8, 0.8, 0.8), 0.5, 0.0), mi.Normal3f(0, 0, 1), vectors(viewer(-0.1)), vectors(viewer(0.7) * [-1, 1, 1])
+        surface((0.8, 0.8, 0.8), 0.5, 0.0),
+        mi.Normal3f(0, 0, 1),
+        vectors(viewer(-0.1)),
+        vectors(viewer(0.7) * [-1, 1, 1]),
     )
     assert np.array(value).min() > 0.05
 
@@ -158,7 +180,9 @@ def test_gradients_agree_with_finite_differences(base, roughness, metallic):
     energy = lambda c, r: 0.5 + 0 * c  # noqa: E731  held fixed in the twin: the table's own slope is tested below
 
     def value(x):
-        f = twin.evaluate(x[None, :3], x[3:4], x[4:5], 0.04, x[None, 5:8], x[None, 8:11], x[None, 11:14], energy)
+        f = twin.evaluate(
+            x[None, :3], x[3:4], x[4:5], 0.04, x[None, 5:8], x[None, 8:11], x[None, 11:14], energy
+        )
         return (f * weight).sum()
 
     x = [mi.Float(float(c)) for c in x0]
@@ -190,7 +214,8 @@ def test_gradient_of_the_albedo_table():
 
 @pytest.mark.parametrize(("base", "roughness", "metallic"), [m for m in MATERIALS if m[1] <= 0.7])
 def test_close_to_mitsubas_principled(base, roughness, metallic):
-    """Same D, F, G; ours is compensated and its diffuse has no retro-reflection: 12 percent at moderate angles, on average 6."""
+    """Same D, F, G; ours is compensated and its diffuse has no retro-reflection: 12 percent at
+    moderate angles, on average 6."""
     material = {
         "type": "principled",
         "base_color": {"type": "rgb", "value": list(base)},

@@ -1,4 +1,5 @@
-"""Material textures: where texels lie, the top row, and that the renderer reads the exported textures the same way."""
+"""Material textures: where texels lie, the top row, and that the renderer reads the exported
+textures the same way."""
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +17,10 @@ def field():
     field = start_material(S, rng.uniform(0.1, 0.9, (S, S, 3)), 0.5, 0.0)
     colour = np.array(field.colour).reshape(S, S, 4)
     colour[..., 3] = rng.uniform(0.2, 0.9, (S, S))
-    field.colour, field.metallic = mi.Float(colour.ravel()), mi.Float(rng.uniform(0, 1, S * S).astype(np.float32))
+    field.colour, field.metallic = (
+        mi.Float(colour.ravel()),
+        mi.Float(rng.uniform(0, 1, S * S).astype(np.float32)),
+    )
     return field
 
 
@@ -33,8 +37,14 @@ def centres():
 
 def test_at_texel_centres_it_is_the_texel(field):
     base, roughness, metallic = pictures(field)
-    for got, expected in zip(look(field, centres()), (base.reshape(-1, 3), roughness.ravel(), metallic.ravel()), strict=True):
-        np.testing.assert_allclose(got, expected, atol=2e-3)  # the last row and column mix in a thousandth of their neighbour
+    for got, expected in zip(
+        look(field, centres()),
+        (base.reshape(-1, 3), roughness.ravel(), metallic.ravel()),
+        strict=True,
+    ):
+        np.testing.assert_allclose(
+            got, expected, atol=2e-3
+        )  # the last row and column mix in a thousandth of their neighbour
 
 
 def test_v_0_is_the_top_row_of_the_pictures(field):
@@ -55,24 +65,47 @@ def test_between_centres_it_is_bilinear(field):
 
 
 def test_the_renderer_reads_the_pictures_where_the_fit_does(field):
-    """A square with uv = position, v = 0 at the top: base colour in the picture against the fit's look-up at the same uv."""
-    from relit.cameras.se3 import look_at
-    from relit.rendering.mitsuba_scene import build_scene, render_channels
+    """A square with uv = position, v = 0 at the top: base colour in the picture against the fit's
+    look-up at the same uv."""
+    from relit.geometry.se3 import look_at
+    from relit.reference.mitsuba_scene import build_scene, render_channels
     from relit.scene import Camera, Material, Mesh
 
     base, roughness, metallic = pictures(field)
     uvs = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
     vertices = np.concatenate([2 * uvs - 1, np.zeros((4, 1))], 1).astype(np.float32)
-    mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile(np.float32([0, 0, 1]), (4, 1)), uvs)
-    scene = build_scene(mesh, Material(base, roughness, metallic), np.eye(4), np.ones((4, 8, 3), np.float32))
+    mesh = Mesh(
+        vertices,
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.tile(np.float32([0, 0, 1]), (4, 1)),
+        uvs,
+    )
+    scene = build_scene(
+        mesh, Material(base, roughness, metallic), np.eye(4), np.ones((4, 8, 3), np.float32)
+    )
     size, distance = 40, 4.0
-    camera = Camera(size, size, size * distance / 2, size * distance / 2, size / 2, size / 2, look_at([0, 0, distance]))
+    camera = Camera(
+        size,
+        size,
+        size * distance / 2,
+        size * distance / 2,
+        size / 2,
+        size / 2,
+        look_at([0, 0, distance]),
+    )
     seen = render_channels(scene, camera, spp=64)
-    x, y = np.meshgrid((np.arange(size) + 0.5) / size, 1 - (np.arange(size) + 0.5) / size)  # pixel rows go down, y goes up
+    x, y = np.meshgrid(
+        (np.arange(size) + 0.5) / size, 1 - (np.arange(size) + 0.5) / size
+    )  # pixel rows go down, y goes up
     got, rough, metal = look(field, np.stack([x.ravel(), y.ravel()], -1))
     inner = np.zeros((size, size), bool)
-    inner[3:-3, 3:-3] = True  # at the border a texture repeats or not: no texel of an atlas lies there
-    for a, b in ((seen["albedo"], got.reshape(size, size, 3)), (seen["roughness"], rough.reshape(size, size))):
+    inner[3:-3, 3:-3] = (
+        True  # at the border a texture repeats or not: no texel of an atlas lies there
+    )
+    for a, b in (
+        (seen["albedo"], got.reshape(size, size, 3)),
+        (seen["roughness"], rough.reshape(size, size)),
+    ):
         difference = np.abs(a - b)[inner]  # a pixel is a mean over a fifth of a texel
         assert difference.mean() < 0.01 and difference.max() < 0.1
     assert np.abs(seen["metallic"] - metal.reshape(size, size))[inner].mean() < 0.01
@@ -85,7 +118,12 @@ def test_gradients_of_texels_against_finite_differences(field):
 
     def loss(colour, metallic):
         field.colour, field.metallic = colour, metallic
-        m = material_at(field, mi.Point2f(mi.Float(uv[:, 0].astype(np.float32)), mi.Float(uv[:, 1].astype(np.float32))))
+        m = material_at(
+            field,
+            mi.Point2f(
+                mi.Float(uv[:, 0].astype(np.float32)), mi.Float(uv[:, 1].astype(np.float32))
+            ),
+        )
         values = (m.base.x, m.base.y, m.base.z, m.roughness, m.metallic)
         return sum(dr.sum(w * dr.square(v)) for w, v in zip(weight, values, strict=True))
 
@@ -97,7 +135,10 @@ def test_gradients_of_texels_against_finite_differences(field):
         g = np.array(dr.grad(array))
         ends = []
         for s in (1, -1):
-            moved = [a + np.float32(s * 1e-2) * np.sign(g) * (i == k) if i == k else a for i, a in enumerate(start)]
+            moved = [
+                a + np.float32(s * 1e-2) * np.sign(g) * (i == k) if i == k else a
+                for i, a in enumerate(start)
+            ]
             ends.append(float(loss(*[mi.Float(a.astype(np.float32)) for a in moved])[0]))
         assert (ends[0] - ends[1]) / 2e-2 == pytest.approx(np.abs(g).sum(), rel=0.02)
 

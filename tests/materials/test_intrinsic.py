@@ -22,7 +22,9 @@ def correlation(a, b):
 def test_shading_is_taken_out_and_two_colours_stay():
     n = ball()
     base = two_colours(n)
-    shading = np.exp(harmonics(n) @ np.array([0.2, 0.6, -0.5, 0.3, 0.2, 0.0, -0.1, 0.15, 0.05]))[:, None]
+    shading = np.exp(harmonics(n) @ np.array([0.2, 0.6, -0.5, 0.3, 0.2, 0.0, -0.1, 0.15, 0.05]))[
+        :, None
+    ]
     got = base_without_shading(base * shading, n, np.ones(len(n)))
     for colour in np.unique(base, axis=0):
         which = (base == colour).all(1)
@@ -33,13 +35,17 @@ def test_shading_is_taken_out_and_two_colours_stay():
 
 
 def test_real_diffuse_shading_is_nearly_taken_out():
-    """Clamped cosine lobes of three lamps: nine harmonics hold 98 % of them, and the result is nearer to the colours than the radiance."""
+    """Clamped cosine lobes of three lamps: nine harmonics hold 98 % of them, and the result is
+    nearer to the colours than the radiance."""
     n = ball(seed=1)
     base = two_colours(n)
     lamps = np.array([[0.3, 0.9, 0.3], [-0.8, 0.4, -0.45], [0, -1, 0.1]])
     shading = (np.maximum(n @ lamps.T, 0) @ np.array([1.0, 0.5, 0.15]) + 0.25)[:, None]
     got = base_without_shading(base * shading, n, np.ones(len(n)))
-    assert correlation(got, base) > 0.95 and correlation(got, base) > correlation(base * shading, base) + 0.05
+    assert (
+        correlation(got, base) > 0.95
+        and correlation(got, base) > correlation(base * shading, base) + 0.05
+    )
 
 
 def test_mean_luminance_is_one_by_area():

@@ -1,4 +1,5 @@
-"""A rough plastic as glTF's dielectric: base colour against diffuse albedo, and the coats against each other."""
+"""A rough plastic as glTF's dielectric: base colour against diffuse albedo, and the coats against
+each other."""
 
 import drjit as dr
 import mitsuba as mi
@@ -14,19 +15,27 @@ IOR = 1.49
 
 
 def hemisphere(side: int = 160):
-    """Directions (Vector3f), evenly in solid angle: a mean of f cos θ_l over them times 2 π is a directional albedo."""
+    """Directions (Vector3f), evenly in solid angle: a mean of f cos θ_l over them times 2 π is a
+    directional albedo."""
     z, phi = np.meshgrid((np.arange(side) + 0.5) / side, 2 * np.pi * (np.arange(side) + 0.5) / side)
     s = np.sqrt(1 - z**2)
-    return mi.Vector3f(*[mi.Float(c.ravel().astype(np.float32)) for c in (s * np.cos(phi), s * np.sin(phi), z)])
+    return mi.Vector3f(
+        *[mi.Float(c.ravel().astype(np.float32)) for c in (s * np.cos(phi), s * np.sin(phi), z)]
+    )
 
 
 def albedos(kd, base, ks, alpha, degrees):
-    """Directional albedos under a uniform light: of the plastic, and of glTF's material with the given base colour."""
+    """Directional albedos under a uniform light: of the plastic, and of glTF's material with the
+    given base colour."""
     n, l = mi.Vector3f(0, 0, 1), hemisphere()
     v = mi.Vector3f(float(np.sin(np.radians(degrees))), 0, float(np.cos(np.radians(degrees))))
-    plastic = rough_plastic.evaluate(Plastic(mi.Color3f(kd), mi.Float(ks), mi.Float(alpha)), Coat(IOR), n, v, l)
+    plastic = rough_plastic.evaluate(
+        Plastic(mi.Color3f(kd), mi.Float(ks), mi.Float(alpha)), Coat(IOR), n, v, l
+    )
     f0 = mi.Color3f(f0_from_ior(IOR) * ks)
-    gltf = brdf.evaluate(brdf.Surface(mi.Color3f(base), mi.Float(np.sqrt(alpha)), mi.Float(0), f0), n, v, l)
+    gltf = brdf.evaluate(
+        brdf.Surface(mi.Color3f(base), mi.Float(np.sqrt(alpha)), mi.Float(0), f0), n, v, l
+    )
     return [2 * np.pi * float(dr.mean(c.x)[0]) for c in (plastic, gltf)]
 
 
@@ -49,25 +58,48 @@ def test_the_diffuse_albedo_itself_would_be_too_bright():
 def test_the_factor_is_the_least_squares_one(alpha, ks):
     """Against random pairs of directions by the cosine: no other factor has a smaller error."""
     rng = np.random.default_rng(1)
-    draw = lambda: mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.random((2, 200_000)).astype(np.float32)))  # noqa: E731
+
+    def draw():
+        return mi.warp.square_to_cosine_hemisphere(
+            mi.Point2f(rng.random((2, 200_000)).astype(np.float32))
+        )
+
     v, l = draw(), draw()
     cos_v, cos_l = (np.array(d.z, np.float64) for d in (v, l))
     m = Plastic(mi.Color3f(1), mi.Float(0), mi.Float(alpha))
-    plastic = np.array(rough_plastic.evaluate(m, Coat(IOR), mi.Vector3f(0, 0, 1), v, l).x, np.float64) / cos_l
+    plastic = (
+        np.array(rough_plastic.evaluate(m, Coat(IOR), mi.Vector3f(0, 0, 1), v, l).x, np.float64)
+        / cos_l
+    )
     h = np.sqrt(np.clip(0.5 + 0.5 * np.array(dr.dot(v, l), np.float64), 0, 1))  # v·h
     f0 = f0_from_ior(IOR) * ks
     gltf = (1 - (f0 + (1 - f0) * (1 - h) ** 5)) / np.pi
     ok = (cos_v > 0.03) & (cos_l > 0.03)  # below it the plastic's cosine is clamped
-    assert float(base_over_diffuse(alpha, ks, IOR)) == pytest.approx((plastic * gltf)[ok].sum() / (gltf**2)[ok].sum(), rel=0.01)
+    assert float(base_over_diffuse(alpha, ks, IOR)) == pytest.approx(
+        (plastic * gltf)[ok].sum() / (gltf**2)[ok].sum(), rel=0.01
+    )
 
 
 def test_maps_there_and_back():
     rng = np.random.default_rng(2)
     kd = rng.uniform(0, 1, (16, 16, 3)).astype(np.float32)
-    roughness, ks = np.sqrt(rng.uniform(0.03, 0.6, (16, 16))).astype(np.float32), rng.uniform(0, 1, (16, 16)).astype(np.float32)
-    for r, s in ((roughness, ks), (roughness[:1, :1], None), (roughness, np.repeat(ks[..., None], 3, -1)), (roughness[::2, ::2], ks)):
+    roughness, ks = (
+        np.sqrt(rng.uniform(0.03, 0.6, (16, 16))).astype(np.float32),
+        rng.uniform(0, 1, (16, 16)).astype(np.float32),
+    )
+    for r, s in (
+        (roughness, ks),
+        (roughness[:1, :1], None),
+        (roughness, np.repeat(ks[..., None], 3, -1)),
+        (roughness[::2, ::2], ks),
+    ):
         base = base_colour(kd, r, s, IOR)
-        assert base.shape == kd.shape and base.dtype == np.float32 and base.min() >= 0 and base.max() <= 1
+        assert (
+            base.shape == kd.shape
+            and base.dtype == np.float32
+            and base.min() >= 0
+            and base.max() <= 1
+        )
         np.testing.assert_allclose(diffuse_albedo(base, r, s, IOR), kd, atol=2e-4)
 
 
@@ -86,11 +118,16 @@ def test_what_would_exceed_white_is_clipped():
 
 @pytest.mark.parametrize("ks", [0.3, 1.0, 1.5])
 def test_both_coats_reflect_alike_at_normal_incidence(ks):
-    """F0 is k_s ((ior - 1) / (ior + 1))^2 of both, and so is the lobe's peak, roughness being sqrt(alpha)."""
+    """F0 is k_s ((ior - 1) / (ior + 1))^2 of both, and so is the lobe's peak, roughness being
+    sqrt(alpha)."""
     assert float(fresnel(mi.Float(1), IOR)[0]) == pytest.approx(f0_from_ior(IOR), rel=1e-5)
     n = mi.Vector3f(0, 0, 1)
     for alpha in (0.05, 0.14, 0.3):
-        plastic = rough_plastic.evaluate(Plastic(mi.Color3f(0), mi.Float(ks), mi.Float(alpha)), Coat(IOR), n, n, n)
+        plastic = rough_plastic.evaluate(
+            Plastic(mi.Color3f(0), mi.Float(ks), mi.Float(alpha)), Coat(IOR), n, n, n
+        )
         f0 = mi.Color3f(f0_from_ior(IOR) * ks)
-        gltf = brdf.evaluate(brdf.Surface(mi.Color3f(0), mi.Float(np.sqrt(alpha)), mi.Float(0), f0), n, n, n)
+        gltf = brdf.evaluate(
+            brdf.Surface(mi.Color3f(0), mi.Float(np.sqrt(alpha)), mi.Float(0), f0), n, n, n
+        )
         assert float(gltf.x[0]) == pytest.approx(float(plastic.x[0]), rel=0.01)

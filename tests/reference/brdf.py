@@ -1,4 +1,5 @@
-"""Slow NumPy twin of `relit.materials.brdf`, written from the papers' formulas in their textbook form."""
+"""Slow NumPy twin of `relit.materials.brdf`, written from the papers' formulas in their textbook
+form."""
 
 import numpy as np
 
@@ -30,11 +31,15 @@ def single_scattering(n, v, l, alpha, f0):
     h = (v + l) / np.linalg.norm(v + l, axis=-1, keepdims=True)
     nl, nv = (n * l).sum(-1), np.maximum((n * v).sum(-1), MIN_COS)
     d = distribution(np.clip((n * h).sum(-1), 1e-4, 1), alpha)
-    return fresnel(f0, (v * h).sum(-1)[..., None]) * (d * masking_shadowing(nl, nv, alpha) / (4 * nl * nv))[..., None]
+    return (
+        fresnel(f0, (v * h).sum(-1)[..., None])
+        * (d * masking_shadowing(nl, nv, alpha) / (4 * nl * nv))[..., None]
+    )
 
 
 def evaluate(base, roughness, metallic, f0, n, v, l, energy):
-    """f(v, l) max(n.l, 0), (N, 3); energy: function (n.v, roughness) -> directional albedo of the lobe with F = 1."""
+    """f(v, l) max(n.l, 0), (N, 3); energy: function (n.v, roughness) -> directional albedo of the
+    lobe with F = 1."""
     alpha = np.maximum(roughness**2, MIN_ALPHA)
     nl, nv = (n * l).sum(-1), np.maximum((n * v).sum(-1), MIN_COS)
     h = (v + l) / np.linalg.norm(v + l, axis=-1, keepdims=True)
@@ -43,4 +48,8 @@ def evaluate(base, roughness, metallic, f0, n, v, l, energy):
     diffuse = base * ((1 - metallic) * (1 - fresnel(f0, (v * h).sum(-1))) / np.pi)[:, None]
     up = nl > 0
     safe = np.where(up[:, None], l, n)
-    return np.where(up[:, None], (diffuse + compensation * single_scattering(n, v, safe, alpha, tint)) * nl[:, None], 0)
+    return np.where(
+        up[:, None],
+        (diffuse + compensation * single_scattering(n, v, safe, alpha, tint)) * nl[:, None],
+        0,
+    )

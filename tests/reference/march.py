@@ -1,4 +1,5 @@
-"""The slow NumPy twin of rendering/march.py: the same quadrature, one ray after another, no adjoint."""
+"""The slow NumPy twin of rendering/march.py: the same quadrature, one ray after another, no
+adjoint."""
 
 import numpy as np
 
@@ -6,7 +7,8 @@ MAX_STEPS, MIN_ALPHA, MIN_TRANSMITTANCE, ACCELERATE = 600, 1e-3, 1e-3, 5.0
 
 
 def cell_of(p, n):
-    """Low corner (x, y, z) and position in the cell; outside the cube the border cell is continued linearly."""
+    """Low corner (x, y, z) and position in the cell; outside the cube the border cell is continued
+    linearly."""
     q = p * (0.5 * (n - 1)) + 0.5 * (n - 1)
     low = np.clip(np.floor(q).astype(int), 0, n - 2)
     return low, q - low

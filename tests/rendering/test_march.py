@@ -1,4 +1,5 @@
-"""The volume march: against its NumPy twin, and its hand-written adjoint against finite differences."""
+"""The volume march: against its NumPy twin, and its hand-written adjoint against finite
+differences."""
 
 import drjit as dr
 import mitsuba as mi
@@ -10,7 +11,12 @@ from relit.geometry.sdf import make_grid, node_positions
 from relit.rendering.march import march, sphere_interval
 
 N, RAYS = 16, 64
-STEPS = {"values": 3e-4, "features": 1e-2, "o": 2e-4, "d": 1e-4}  # large against float32, small against the kinks of the quadrature
+STEPS = {
+    "values": 3e-4,
+    "features": 1e-2,
+    "o": 2e-4,
+    "d": 1e-4,
+}  # large against float32, small against the kinks of the quadrature
 
 
 def vectors(x):
@@ -20,8 +26,14 @@ def vectors(x):
 def lumpy():
     """Distances and features (n, n, n, 4) of a small object without symmetry."""
     p = node_positions(N)
-    values = np.linalg.norm(p - np.array([0.1, 0, 0.05]), axis=-1) - 0.6 + 0.05 * np.sin(5 * p[..., 0]) * np.cos(4 * p[..., 1])
-    return values.astype(np.float32), np.random.default_rng(1).uniform(0, 1, (N, N, N, 4)).astype(np.float32)
+    values = (
+        np.linalg.norm(p - np.array([0.1, 0, 0.05]), axis=-1)
+        - 0.6
+        + 0.05 * np.sin(5 * p[..., 0]) * np.cos(4 * p[..., 1])
+    )
+    return values.astype(np.float32), np.random.default_rng(1).uniform(0, 1, (N, N, N, 4)).astype(
+        np.float32
+    )
 
 
 def rays(rng, count, distance=2.5, spread=0.5):
@@ -37,8 +49,21 @@ def interval(o, d):
 
 
 def run(grid, o, d, t0, t1, inv_s, dt):
-    m = march(grid, vectors(o), vectors(d), mi.Float(t0), mi.Float(t1), dr.opaque(mi.Float, inv_s), dr.opaque(mi.Float, dt))
-    return np.array([np.array(f) for f in m.features]).T, np.array(m.normal).T, np.array(m.depth), np.array(m.transmittance)
+    m = march(
+        grid,
+        vectors(o),
+        vectors(d),
+        mi.Float(t0),
+        mi.Float(t1),
+        dr.opaque(mi.Float, inv_s),
+        dr.opaque(mi.Float, dt),
+    )
+    return (
+        np.array([np.array(f) for f in m.features]).T,
+        np.array(m.normal).T,
+        np.array(m.depth),
+        np.array(m.transmittance),
+    )
 
 
 @pytest.mark.parametrize("sharpness, step", [(1.0, 0.9), (4.0, 0.3)])
@@ -53,22 +78,37 @@ def test_forward_agrees_with_the_twin(sharpness, step, band):
     t0, t1 = interval(o, d)
     inv_s, dt = sharpness / grid.h, step * grid.h
     got = run(grid, o, d, t0, t1, inv_s, dt)
-    want = twin.march(values.astype(float), features.astype(float), o.astype(float), d.astype(float), t0, t1, inv_s, dt)
+    want = twin.march(
+        values.astype(float),
+        features.astype(float),
+        o.astype(float),
+        d.astype(float),
+        t0,
+        t1,
+        inv_s,
+        dt,
+    )
     assert want[3].min() < 0.1 and want[3].max() > 0.95  # some rays hit, some do not
-    for name, a, b in zip(("features", "normal", "depth", "transmittance"), got, want, strict=False):
-        # A sample whose alpha stands at MIN_ALPHA, or whose T at MIN_TRANSMITTANCE, may fall on either side in float32.
+    for name, a, b in zip(
+        ("features", "normal", "depth", "transmittance"), got, want, strict=False
+    ):
+        # A sample whose alpha stands at MIN_ALPHA, or whose T at MIN_TRANSMITTANCE, may fall on
+        # either side in float32.
         assert np.abs(a - b).max() < 5e-3, name
         assert np.quantile(np.abs(a - b), 0.95) < 1e-4, name
 
 
 def test_weights_and_features_add_up():
-    """Constant features come out times the opacity, and the accumulated gradient points back along central rays."""
+    """Constant features come out times the opacity, and the accumulated gradient points back along
+    central rays."""
     values, _ = lumpy()
     grid = make_grid(values, 4, band=np.inf, fill=[1.0, 2.0, 3.0, 4.0])
     o, d = rays(np.random.default_rng(2), RAYS)
     t0, t1 = interval(o, d)
     F, normal, depth, T = run(grid, o, d, t0, t1, 4 / grid.h, 0.2 * grid.h)
-    assert np.abs(F - (1 - T)[:, None] * [1, 2, 3, 4]).max() < 0.1  # up to the samples below MIN_ALPHA
+    assert (
+        np.abs(F - (1 - T)[:, None] * [1, 2, 3, 4]).max() < 0.1
+    )  # up to the samples below MIN_ALPHA
     hit = T < 0.01
     assert hit.sum() > 30
     assert ((normal * d).sum(1)[hit] < 0).all()
@@ -80,7 +120,9 @@ def test_rays_that_miss_see_nothing():
     values, features = lumpy()
     grid = make_grid(values, 4, band=np.inf, features=features)
     o = np.tile(np.array([[0, 0, -3]], np.float32), (3, 1))
-    d = np.array([[0, 0, -1], [1, 0, 0], [0.6, 0, 0.8]], np.float32)  # away, sideways, past the sphere
+    d = np.array(
+        [[0, 0, -1], [1, 0, 0], [0.6, 0, 0.8]], np.float32
+    )  # away, sideways, past the sphere
     t0, t1 = interval(o, d)
     assert (t1 <= t0).all()
     F, normal, depth, T = run(grid, o, d, t0, t1, 4 / grid.h, 0.2 * grid.h)
@@ -114,26 +156,51 @@ def test_sphere_interval():
 
 
 class Problem:
-    """A weighted sum of all outputs as a function of row values, features, origins and directions."""
+    """A weighted sum of all outputs as a function of row values, features, origins and
+    directions."""
 
-    def __init__(self, weights=("features", "normal", "depth", "transmittance"), sharpness=1.0, step=0.1):
+    def __init__(
+        self, weights=("features", "normal", "depth", "transmittance"), sharpness=1.0, step=0.1
+    ):
         rng = np.random.default_rng(0)
         values, features = lumpy()
         self.grid = make_grid(values, 4, band=np.inf, features=features)
         o, d = rays(rng, RAYS)
-        w = {k: rng.normal(size=s) for k, s in {"features": (4, RAYS), "normal": (3, RAYS), "depth": RAYS, "transmittance": RAYS}.items()}
+        w = {
+            k: rng.normal(size=s)
+            for k, s in {
+                "features": (4, RAYS),
+                "normal": (3, RAYS),
+                "depth": RAYS,
+                "transmittance": RAYS,
+            }.items()
+        }
         self.w = {k: v.astype(np.float32) * (k in weights) for k, v in w.items()}
-        self.inv_s, self.dt = dr.opaque(mi.Float, sharpness / self.grid.h), dr.opaque(mi.Float, step * self.grid.h)
+        self.inv_s, self.dt = (
+            dr.opaque(mi.Float, sharpness / self.grid.h),
+            dr.opaque(mi.Float, step * self.grid.h),
+        )
         # the interval is a constant of the quadrature
         self.t0, self.t1 = sphere_interval(vectors(o), vectors(d))
-        self.start = {"values": np.array(self.grid.row_values), "features": np.array(self.grid.features), "o": o, "d": d}
+        self.start = {
+            "values": np.array(self.grid.row_values),
+            "features": np.array(self.grid.features),
+            "o": o,
+            "d": d,
+        }
 
     def loss(self, x):
         grid = self.grid
         grid.row_values, grid.features = x["values"], x["features"]
-        dr.scatter(grid.values, dr.gather(mi.Float, dr.detach(x["values"]), dr.arange(mi.UInt32, grid.rows - 1) + 1), grid.nodes)
+        dr.scatter(
+            grid.values,
+            dr.gather(mi.Float, dr.detach(x["values"]), dr.arange(mi.UInt32, grid.rows - 1) + 1),
+            grid.nodes,
+        )
         m = march(grid, x["o"], x["d"], self.t0, self.t1, self.inv_s, self.dt)
-        out = dr.sum(m.depth * mi.Float(self.w["depth"])) + dr.sum(m.transmittance * mi.Float(self.w["transmittance"]))
+        out = dr.sum(m.depth * mi.Float(self.w["depth"])) + dr.sum(
+            m.transmittance * mi.Float(self.w["transmittance"])
+        )
         for k in range(4):
             out += dr.sum(m.features[k] * mi.Float(self.w["features"][k]))
         for k in range(3):
@@ -144,13 +211,18 @@ class Problem:
         x = dict(self.start)
         if changed:
             x[changed] = x[changed] + change
-        return {k: vectors(v) if v.ndim == 2 else mi.Float(v.astype(np.float32)) for k, v in x.items()}
+        return {
+            k: vectors(v) if v.ndim == 2 else mi.Float(v.astype(np.float32)) for k, v in x.items()
+        }
 
     def gradients(self):
         x = self.arrays()
         dr.enable_grad(*x.values())
         dr.backward(self.loss(x))
-        return {k: np.array(dr.grad(v)).T if self.start[k].ndim == 2 else np.array(dr.grad(v)) for k, v in x.items()}
+        return {
+            k: np.array(dr.grad(v)).T if self.start[k].ndim == 2 else np.array(dr.grad(v))
+            for k, v in x.items()
+        }
 
     def difference(self, name, direction):
         e = STEPS[name]
@@ -166,7 +238,8 @@ def problem():
 
 @pytest.mark.parametrize("name", ["values", "features", "o", "d"])
 def test_gradient_agrees_with_finite_differences(problem, name):
-    """Along the sign of the gradient: a random direction cancels, and what is left is samples that cross MIN_ALPHA."""
+    """Along the sign of the gradient: a random direction cancels, and what is left is samples that
+    cross MIN_ALPHA."""
     p, gradients = problem
     g = gradients[name]
     direction = np.sign(g).astype(np.float32)
@@ -176,14 +249,20 @@ def test_gradient_agrees_with_finite_differences(problem, name):
 
 @pytest.mark.parametrize("name", ["values", "features", "o", "d"])
 def test_the_adjoint_itself_is_exact(monkeypatch, name):
-    """Without MIN_ALPHA, whose crossing moves the difference and not the gradient, the two agree to .1 %.
+    """Without MIN_ALPHA, whose crossing moves the difference and not the gradient, the two agree to
+    .1 %.
 
-    Rays that move see the trilinear normal jump from cell to cell, which is no part of its derivative: where everything is moved along the
-    sign of the gradient the normal's share is up to 40 % short. So origins and directions are tested on the other outputs; a field whose
-    normal does not jump is in tests/fit/test_gradients.py.
+    Rays that move see the trilinear normal jump from cell to cell, which is no part of its
+    derivative: where everything is moved along the sign of the gradient the normal's share is up to
+    40 % short. So origins and directions are tested on the other outputs; a field whose normal does
+    not jump is in tests/fit/test_gradients.py.
     """
     monkeypatch.setattr("relit.rendering.march.MIN_ALPHA", 0.0)
-    p = Problem() if name in ("values", "features") else Problem(weights=("features", "depth", "transmittance"))
+    p = (
+        Problem()
+        if name in ("values", "features")
+        else Problem(weights=("features", "depth", "transmittance"))
+    )
     g = p.gradients()[name]
     direction = np.sign(g).astype(np.float32)
     assert p.difference(name, direction) == pytest.approx(float((g * direction).sum()), rel=0.005)
@@ -194,12 +273,15 @@ def test_gradient_of_each_output(output):
     p = Problem(weights=(output,))
     g = p.gradients()["values"]
     direction = np.sign(g).astype(np.float32)
-    assert p.difference("values", direction) == pytest.approx(float((g * direction).sum()), rel=0.02)
+    assert p.difference("values", direction) == pytest.approx(
+        float((g * direction).sum()), rel=0.02
+    )
 
 
 def test_gradient_of_blocks_of_the_grid(monkeypatch):
-    """The eight octants one by one, so that errors of opposite sign cannot hide each other. Without MIN_ALPHA: the few rays of an octant
-    cross it often enough to move the difference by up to 6 %; without it the two agree to 0.1 %."""
+    """The eight octants one by one, so that errors of opposite sign cannot hide each other. Without
+    MIN_ALPHA: the few rays of an octant cross it often enough to move the difference by up to 6 %;
+    without it the two agree to 0.1 %."""
     monkeypatch.setattr("relit.rendering.march.MIN_ALPHA", 0.0)
     p = Problem()
     g = p.gradients()["values"]
@@ -207,11 +289,14 @@ def test_gradient_of_blocks_of_the_grid(monkeypatch):
     for k in np.unique(octant):
         direction = np.zeros_like(g)
         direction[1:] = np.sign(g[1:]) * (octant == k)
-        assert p.difference("values", direction) == pytest.approx(float((g * direction).sum()), rel=0.005), k
+        assert p.difference("values", direction) == pytest.approx(
+            float((g * direction).sum()), rel=0.005
+        ), k
 
 
 def test_outside_the_band_nothing_gets_a_gradient():
-    """Row 0 takes what falls on nodes outside the band, and it belongs to none of them; the rows of the band do as without a band."""
+    """Row 0 takes what falls on nodes outside the band, and it belongs to none of them; the rows of
+    the band do as without a band."""
     values, features = lumpy()
     o, d = rays(np.random.default_rng(0), RAYS)
     found = {}
@@ -219,7 +304,15 @@ def test_outside_the_band_nothing_gets_a_gradient():
         grid = make_grid(values, 4, band=band, features=np.full_like(features, 0.5), fill=0.5)
         dr.enable_grad(grid.row_values)
         t0, t1 = sphere_interval(vectors(o), vectors(d))
-        m = march(grid, vectors(o), vectors(d), t0, t1, dr.opaque(mi.Float, 1 / grid.h), dr.opaque(mi.Float, 0.5 * grid.h))
+        m = march(
+            grid,
+            vectors(o),
+            vectors(d),
+            t0,
+            t1,
+            dr.opaque(mi.Float, 1 / grid.h),
+            dr.opaque(mi.Float, 0.5 * grid.h),
+        )
         dr.backward(dr.sum(m.transmittance))
         g, at = np.zeros(N**3), np.array(grid.nodes)
         g[at] = np.array(dr.grad(grid.row_values))[1:]

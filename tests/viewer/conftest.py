@@ -1,4 +1,5 @@
-"""A small run folder, and the page driven in a headless Chromium by steps (viewer/test/drive.mjs)."""
+"""A small run folder, and the page driven in a headless Chromium by steps
+(viewer/test/drive.mjs)."""
 
 from __future__ import annotations
 
@@ -12,16 +13,18 @@ import pytest
 from looking import HEIGHT, WIDTH, lopsided, serve
 
 from relit.asset.asset import save_asset
-from relit.cameras.se3 import look_at
-from relit.capture.procedural import pawn
 from relit.conventions import move_points, similarity
+from relit.geometry.se3 import look_at
 from relit.images import write_srgb
-from relit.rendering.mitsuba_scene import build_scene, render
+from relit.reference.mitsuba_scene import build_scene, render
 from relit.scene import Asset, Camera
+from relit.synthesize.procedural import pawn
 from relit.viewer.page import PAGE
 
 ROOT = Path(__file__).resolve().parents[2]
-CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
+CHROMIUM = next(
+    (p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None
+)
 
 
 @pytest.fixture(scope="session")
@@ -34,10 +37,15 @@ def asset() -> Asset:
     cameras = []
     for i in range(3):
         angle = 0.3 + 1.7 * i
-        eye, target = move_points(world_from_asset, np.array([[3.4 * np.sin(angle), 1.6, 3.4 * np.cos(angle)], [0, 0.8, 0]]))
+        eye, target = move_points(
+            world_from_asset,
+            np.array([[3.4 * np.sin(angle), 1.6, 3.4 * np.cos(angle)], [0, 0.8, 0]]),
+        )
         pose = look_at(eye, target, turn @ [0, 1, 0])
         cameras.append((f"images/p{i}.png", Camera(WIDTH, HEIGHT, 125, 120, 50, 39, pose)))
-    return Asset(mesh, material, world_from_asset, lopsided(), tuple(cameras), {"capture": "multiview"})
+    return Asset(
+        mesh, material, world_from_asset, lopsided(), tuple(cameras), {"capture": "multiview"}
+    )
 
 
 @pytest.fixture(scope="session")
@@ -79,7 +87,8 @@ def built() -> None:
 
 @pytest.fixture(scope="session")
 def drive(built):
-    """drive(url, steps) -> the results of the steps that have one; fails where the page reported an error."""
+    """drive(url, steps) -> the results of the steps that have one; fails where the page reported an
+    error."""
     if not shutil.which("node") or not (ROOT / "viewer/node_modules/playwright-core").is_dir():
         pytest.skip("needs node and viewer/node_modules (make viewer)")
     if CHROMIUM is None:
@@ -87,7 +96,9 @@ def drive(built):
 
     def act(url, steps, errors_allowed=False):
         command = ["node", str(ROOT / "viewer/test/drive.mjs"), CHROMIUM, url]
-        done = subprocess.run(command, input=json.dumps(steps), capture_output=True, text=True, timeout=120)
+        done = subprocess.run(
+            command, input=json.dumps(steps), capture_output=True, text=True, timeout=120
+        )
         assert done.returncode == 0 and done.stdout, done.stderr
         answer = json.loads(done.stdout)
         assert "failed" not in answer, answer

@@ -1,4 +1,5 @@
-"""Masks and the object sphere that people correct: kept beside the capture, used when it is opened, painted in the page."""
+"""Masks and the object sphere that people correct: kept beside the capture, used when it is opened,
+painted in the page."""
 
 from __future__ import annotations
 
@@ -13,10 +14,10 @@ import pytest
 from looking import READY, serve
 from test_serve import ask
 
-from relit.capture import open_capture
 from relit.capture.corrections import FOLDER, save_mask, save_sphere, sphere_from_boxes
+from relit.capture.open import open_capture
 from relit.errors import UserError
-from relit.plan import Job, input_digests, open_input
+from relit.job import Job, input_digests, open_input
 from relit.scene import Sphere
 from relit.viewer.correct import correction_server
 
@@ -44,7 +45,9 @@ def test_a_corrected_mask_wins(capture):
     assert any("1 masks were corrected by hand" in n for n in after.notes)
     assert input_digests(after) != digest  # a run that was begun before notices
     assert open_capture(capture, masks="none").photos[2].load().mask is None
-    save_mask(capture, before.photos[2], cv2.resize(disc(20, 24, 9), (96, 96)))  # painted larger than the photo
+    save_mask(
+        capture, before.photos[2], cv2.resize(disc(20, 24, 9), (96, 96))
+    )  # painted larger than the photo
     assert np.abs(open_capture(capture).photos[2].load().mask - disc(20, 24, 9)).mean() < 0.03
 
 
@@ -59,7 +62,9 @@ def test_photos_without_masks_need_all_of_them(tmp_path):
     for photo in photos[:-1]:
         save_mask(folder, photo, disc(24, 24, 12))
     half = open_capture(folder)
-    assert half.photos[0].load().mask is None and any("not used until all have one" in n for n in half.notes)
+    assert half.photos[0].load().mask is None and any(
+        "not used until all have one" in n for n in half.notes
+    )
     save_mask(folder, photos[-1], disc(24, 24, 12))
     assert open_capture(folder).photos[0].load().mask.sum() == disc(24, 24, 12).sum()
 
@@ -75,8 +80,9 @@ def test_a_corrected_photo_is_not_left_out(capture):
 
 
 def test_grabcut_leaves_a_corrected_mask_alone(capture):
-    """Also of a photo that was undistorted since, as it is when its camera was found from the photos."""
-    from relit.capture.opening import with_grabcut
+    """Also of a photo that was undistorted since, as it is when its camera was found from the
+    photos."""
+    from relit.capture.open import with_grabcut
     from relit.capture.photo import with_camera
 
     save_mask(capture, open_capture(capture).photos[0], disc(20, 24, 6))
@@ -84,7 +90,10 @@ def test_grabcut_leaves_a_corrected_mask_alone(capture):
     bent = [with_camera(p, replace(p.camera, distortion=(0.01, 0, 0, 0))) for p in opened.photos]
     masks = [p.load().mask for p in with_grabcut(replace(opened, photos=tuple(bent))).photos]
     h, w = masks[0].shape
-    assert np.abs(masks[0] - disc(20, 24, 6)[:h, :w]).mean() < 0.03 and masks[1].sum() > 2 * masks[0].sum()
+    assert (
+        np.abs(masks[0] - disc(20, 24, 6)[:h, :w]).mean() < 0.03
+        and masks[1].sum() > 2 * masks[0].sum()
+    )
 
 
 def test_shapes_and_files_that_do_not_fit(capture):
@@ -96,7 +105,11 @@ def test_shapes_and_files_that_do_not_fit(capture):
     cv2.imwrite(str(path), np.zeros((20, 80), np.uint8))
     with pytest.raises(UserError, match="different shapes"):
         open_capture(capture).photos[0].load()
-    senseless = ['{"centre": [0, 0], "radius": 1}', '{"centre": [0, 0, 0], "radius": -1}', '{"centre": [0, 0, NaN], "radius": 1}']
+    senseless = [
+        '{"centre": [0, 0], "radius": 1}',
+        '{"centre": [0, 0, 0], "radius": -1}',
+        '{"centre": [0, 0, NaN], "radius": 1}',
+    ]
     for text in ("{", "[]", *senseless):
         (capture / FOLDER / "sphere.json").write_text(text)
         with pytest.raises(UserError, match="corrected object sphere"):
@@ -107,7 +120,9 @@ def test_the_corrected_sphere(capture):
     save_sphere(capture, Sphere(np.array([0.0, 0.1, 0.0]), 0.9))
     found = open_capture(capture)
     assert found.sphere.radius == 0.9 and any("the corrected one" in n for n in found.notes)
-    assert open_input(capture, Job(sphere=(0, 0, 0, 0.8))).sphere.radius == 0.8  # the command line wins
+    assert (
+        open_input(capture, Job(sphere=(0, 0, 0, 0.8))).sphere.radius == 0.8
+    )  # the command line wins
 
 
 def test_a_sphere_from_boxes(capture):
@@ -120,7 +135,9 @@ def test_a_sphere_from_boxes(capture):
         return c, (x - r, y - r, x + r, y + r)
 
     found = sphere_from_boxes([box(c) for c in cameras[:3]])
-    assert np.allclose(found.centre, centre, atol=1e-6) and found.radius == pytest.approx(radius, rel=1e-6)
+    assert np.allclose(found.centre, centre, atol=1e-6) and found.radius == pytest.approx(
+        radius, rel=1e-6
+    )
     with pytest.raises(UserError, match="one box"):
         sphere_from_boxes([box(cameras[0])])
     with pytest.raises(UserError, match="one side"):
@@ -134,7 +151,10 @@ def test_the_server_of_corrections(built, capture):
         state = json.loads(ask(server, "/manifest.json")[1])
         assert state["mode"] == "edit" and len(state["photos"]) == 6
         assert state["photos"][0] == {"name": "images/p0.png", "corrected": False, "w": 48, "h": 48}
-        assert ask(server, "/photo.jpg?i=0")[1][:2] == b"\xff\xd8" and ask(server, "/mask.png?i=0")[1][1:4] == b"PNG"
+        assert (
+            ask(server, "/photo.jpg?i=0")[1][:2] == b"\xff\xd8"
+            and ask(server, "/mask.png?i=0")[1][1:4] == b"PNG"
+        )
         for query in ("", "?i=6", "?i=-1", "?i=x", "?i=../../etc/passwd"):
             assert ask(server, "/photo.jpg" + query)[0] == 404
         good = cv2.imencode(".png", (disc(20, 20, 8) * 255).astype(np.uint8))[1].tobytes()
@@ -148,8 +168,12 @@ def test_the_server_of_corrections(built, capture):
         assert not (capture / FOLDER).exists()
         assert ask(server, "/mask?i=0", "POST", good, **own)[0] == 200
         assert np.array_equal(open_capture(capture).photos[0].load().mask, disc(20, 20, 8))
-        assert ask(server, "/mask?i=0", "POST", b"", **own)[0] == 200 and not list((capture / FOLDER / "masks").iterdir())
-        code, said, _ = ask(server, "/boxes", "POST", json.dumps([{"i": 0, "box": [9, 9, 40, 40]}]).encode(), **own)
+        assert ask(server, "/mask?i=0", "POST", b"", **own)[0] == 200 and not list(
+            (capture / FOLDER / "masks").iterdir()
+        )
+        code, said, _ = ask(
+            server, "/boxes", "POST", json.dumps([{"i": 0, "box": [9, 9, 40, 40]}]).encode(), **own
+        )
         assert code == 422 and "one box" in json.loads(said)["error"]
         assert ask(server, "/boxes", "POST", b"not json", **own)[0] == 500
         assert ask(server, "/files/../test.txt")[0] == 404
@@ -176,9 +200,14 @@ def test_a_box_gives_a_mask_without_cameras(built, capture):
     photos_only(capture)
     for i in range(6):
         rgb = np.array(cv2.imread(str(capture / f"images/p{i}.png")), np.uint8)
-        around = np.random.default_rng(i).integers(90, 110, rgb.shape, dtype=np.uint8)  # grey, and no backdrop that a threshold finds
+        around = np.random.default_rng(i).integers(
+            90, 110, rgb.shape, dtype=np.uint8
+        )  # grey, and no backdrop that a threshold finds
         around[:24] += 60
-        cv2.imwrite(str(capture / f"images/p{i}.png"), np.where(picture(i)[..., 3:] > 127, picture(i)[..., 2::-1], around))
+        cv2.imwrite(
+            str(capture / f"images/p{i}.png"),
+            np.where(picture(i)[..., 3:] > 127, picture(i)[..., 2::-1], around),
+        )
     opened = open_capture(capture)
     assert not opened.has_cameras
     server = serve(lambda: correction_server(opened))
@@ -187,12 +216,17 @@ def test_a_box_gives_a_mask_without_cameras(built, capture):
         state = json.loads(ask(server, "/manifest.json")[1])
         assert state["cut"] is True and state["boxes"] is False
         for bad in ([10, 10, 11, 11], [0, 0, 48, 48]):
-            code, said, _ = ask(server, "/cut", "POST", json.dumps({"i": 0, "box": bad}).encode(), **own)
+            code, said, _ = ask(
+                server, "/cut", "POST", json.dumps({"i": 0, "box": bad}).encode(), **own
+            )
             assert code == 422 and "the box is too small" in json.loads(said)["error"]
         for i in range(6):
             y, x = np.nonzero(picture(i)[..., 3] > 127)
             box = [int(x.min()) - 2, int(y.min()) - 2, int(x.max()) + 3, int(y.max()) + 3]
-            assert ask(server, "/cut", "POST", json.dumps({"i": i, "box": box}).encode(), **own)[0] == 200
+            assert (
+                ask(server, "/cut", "POST", json.dumps({"i": i, "box": box}).encode(), **own)[0]
+                == 200
+            )
     finally:
         server.shutdown()
         server.server_close()
@@ -205,12 +239,18 @@ def test_a_pile_has_no_box(built, tmp_path):
     labels = np.zeros((96, 160), np.uint8)
     for k in range(3):
         cv2.circle(labels, (30 + 48 * k, 48), 18, 60 + 40 * k, -1)
-    cv2.imwrite(str(tmp_path / "pile.png"), np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8))
+    cv2.imwrite(
+        str(tmp_path / "pile.png"),
+        np.random.default_rng(0).integers(0, 255, (96, 160, 3), np.uint8),
+    )
     cv2.imwrite(str(tmp_path / "pile_labels.png"), labels)
     server = serve(lambda: correction_server(open_capture(tmp_path)))
     try:
         assert json.loads(ask(server, "/manifest.json")[1])["cut"] is False
-        body, own = json.dumps({"i": 0, "box": [9, 9, 40, 40]}).encode(), {"Origin": server.url.rstrip("/")}
+        body, own = (
+            json.dumps({"i": 0, "box": [9, 9, 40, 40]}).encode(),
+            {"Origin": server.url.rstrip("/")},
+        )
         code, said, _ = ask(server, "/cut", "POST", body, **own)
         assert code == 422 and "no single box" in json.loads(said)["error"]
     finally:
@@ -248,19 +288,25 @@ def test_painting_in_the_page(drive, capture, tmp_path):
                 {"wait": "relit.edit.i === 3"},
                 {"drag": [0.2, 0.2, 0.8, 0.8]},
                 {"click": "#save-boxes"},
-                {"wait": "document.getElementById('message').textContent.includes('sphere was saved')"},
+                {
+                    "wait": "document.getElementById('message').textContent.includes('sphere was saved')"
+                },
                 {"eval": "relit.edit.boxes.size"},
                 {"click": '[data-photo="4"]'},
                 {"wait": "relit.edit.i === 4"},
                 {"drag": [0.1, 0.1, 0.9, 0.9]},
                 {"click": "#cut"},
-                {"wait": "document.getElementById('message').textContent === 'the mask in the box was saved'"},
+                {
+                    "wait": "document.getElementById('message').textContent === 'the mask in the box was saved'"
+                },
             ],
         )
     finally:
         server.shutdown()
         server.server_close()
-    assert results[0][2] > results[0][0] + 60 and results[1][2] < results[0][2] - 60  # blue, then painted
+    assert (
+        results[0][2] > results[0][0] + 60 and results[1][2] < results[0][2] - 60
+    )  # blue, then painted
     assert results[2] == 2
     after = open_capture(capture)
     painted = after.photos[0].load().mask - before.photos[0].load().mask

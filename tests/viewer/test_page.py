@@ -14,12 +14,14 @@ from PIL import Image
 
 from relit.conventions import rotate_environment, srgb_from_linear
 from relit.images import write_linear
-from relit.rendering.mitsuba_scene import build_scene, render, render_channels
+from relit.reference.mitsuba_scene import build_scene, render, render_channels
 from relit.run import Run
 
 SIZE = f"relit.viewer.resize({WIDTH}, {HEIGHT}, 1)"
 PICTURE = "relit.viewer.canvas.toDataURL()"
-SHOWN = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))"
+SHOWN = (
+    "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(null))))"
+)
 # a picture of the first photo's camera, drawn at once without path tracing
 FAST = f"""(async () => {{
   const v = relit.viewer;
@@ -45,7 +47,12 @@ COMPARED = """(() => {
 
 
 def decoded(uri):
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))).convert("RGB"), np.float32) / 255
+    return (
+        np.asarray(
+            Image.open(io.BytesIO(base64.b64decode(uri.split(",")[1]))).convert("RGB"), np.float32
+        )
+        / 255
+    )
 
 
 def linear(values):
@@ -54,7 +61,8 @@ def linear(values):
 
 @pytest.fixture(scope="module")
 def traced(drive, server, asset, tmp_path_factory):
-    """Path traced pictures: under the recovered light, under a dropped one turned by 70 degrees, and of a flash."""
+    """Path traced pictures: under the recovered light, under a dropped one turned by 70 degrees,
+    and of a flash."""
     light = tmp_path_factory.mktemp("lights") / "window.hdr"
     write_linear(light, lopsided(16))
     steps = [
@@ -72,15 +80,24 @@ def traced(drive, server, asset, tmp_path_factory):
 
 def test_it_draws_what_mitsuba_draws(traced, reference):
     picture = traced[0]
-    assert psnr(np.clip(srgb_from_linear(picture[..., :3]), 0, 1), reference) > 30  # 64 samples; what is left is noise
+    assert (
+        psnr(np.clip(srgb_from_linear(picture[..., :3]), 0, 1), reference) > 30
+    )  # 64 samples; what is left is noise
     inside = reference[..., 3] > 0.99
-    assert np.abs((picture[..., :3] - reference[..., :3])[inside].mean(0) / reference[inside, :3].mean(0)).max() < 0.02
+    assert (
+        np.abs(
+            (picture[..., :3] - reference[..., :3])[inside].mean(0) / reference[inside, :3].mean(0)
+        ).max()
+        < 0.02
+    )
     assert np.abs(picture[..., 3] - reference[..., 3]).mean() < 0.005
 
 
 def test_a_mirrored_light_would_be_seen(asset, reference):
     """The test above proves nothing if this fails."""
-    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment[:, ::-1])
+    scene = build_scene(
+        asset.mesh, asset.material, asset.world_from_asset, asset.environment[:, ::-1]
+    )
     mirrored = render(scene, asset.cameras[0][1], spp=32)
     assert psnr(np.clip(srgb_from_linear(mirrored[..., :3]), 0, 1), reference) < 24
 
@@ -88,7 +105,9 @@ def test_a_mirrored_light_would_be_seen(asset, reference):
 def test_a_dropped_light_stands_upright_and_turns(traced, asset):
     a = np.radians(70)
     turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    rotation = asset.world_from_asset[:3, :3] / np.cbrt(np.linalg.det(asset.world_from_asset[:3, :3]))
+    rotation = asset.world_from_asset[:3, :3] / np.cbrt(
+        np.linalg.det(asset.world_from_asset[:3, :3])
+    )
     light = rotate_environment(lopsided(16), rotation @ turn)
     scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, light)
     wanted = render(scene, asset.cameras[0][1], spp=128)
@@ -96,20 +115,31 @@ def test_a_dropped_light_stands_upright_and_turns(traced, asset):
 
 
 def test_a_flash_is_a_point_at_the_camera(traced, asset):
-    """Against one formula at the brightest place of the clay: radiance I / (pi d^2) on a white wall, times what is not white."""
+    """Against one formula at the brightest place of the clay: radiance I / (pi d^2) on a white
+    wall, times what is not white."""
     camera = asset.cameras[0][1]
     scene = build_scene(asset.mesh, asset.material, asset.world_from_asset)
     seen = render_channels(scene, camera, spp=4)
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    points = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1) * seen["depth"][..., None]
+    points = (
+        np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+        * seen["depth"][..., None]
+    )
     to = np.array([0.4, -0.3, 0.1]) - points
     far = np.linalg.norm(to, axis=-1)
     normals = seen["normal"] @ camera.world_from_camera[:3, :3]
     cosine = np.clip((normals * to).sum(-1) / far, 0, None)
     lambert = seen["albedo"] * (cosine / (np.pi * far**2))[..., None] * [30, 25, 20]
-    clay = (seen["alpha"] > 0.99) & (seen["roughness"] > 0.6) & (seen["metallic"] < 0.01) & (cosine > 0.4)
+    clay = (
+        (seen["alpha"] > 0.99)
+        & (seen["roughness"] > 0.6)
+        & (seen["metallic"] < 0.01)
+        & (cosine > 0.4)
+    )
     share = traced[2][clay, :3].sum(0) / lambert[clay].sum(0)
-    assert (clay.sum() > 50 and print(share)) or ((share > 0.93).all() and (share < 1.25).all())  # the lobe adds, inter-reflections add
+    assert (clay.sum() > 50 and print(share)) or (
+        (share > 0.93).all() and (share < 1.25).all()
+    )  # the lobe adds, inter-reflections add
 
 
 def test_buttons(drive, server, asset, reference, tmp_path):
@@ -127,8 +157,12 @@ def test_buttons(drive, server, asset, reference, tmp_path):
         {"shot": str(tmp_path / "page.png")},
     ]  # fmt: skip
     results = drive(server.url, steps)
-    fast, albedo, roughness, metallic, normal, brighter, neutral, photo = [decoded(r) for r in results[:-1]]
-    assert psnr(fast, reference) > 22  # three's own image-based light: no shadows, no inter-reflections
+    fast, albedo, roughness, metallic, normal, brighter, neutral, photo = [
+        decoded(r) for r in results[:-1]
+    ]
+    assert (
+        psnr(fast, reference) > 22
+    )  # three's own image-based light: no shadows, no inter-reflections
     assert np.abs(albedo - srgb_from_linear(truth["albedo"]))[inside].mean() < 0.02
     assert np.abs(roughness[..., 0] - truth["roughness"])[inside].mean() < 0.02
     assert np.abs(metallic[..., 0] - truth["metallic"])[inside].mean() < 0.02
@@ -137,7 +171,9 @@ def test_buttons(drive, server, asset, reference, tmp_path):
     dark = inside & (fast.max(-1) < 0.4) & (fast.min(-1) > 0.1)
     assert np.abs(srgb_from_linear(2 * _decode(fast)) - brighter)[dark].mean() < 0.01
     assert (neutral[inside] <= brighter[inside] + 0.01).mean() > 0.99
-    assert np.abs(photo - fast)[inside].max() < 0.02 and results[-1] is True  # the photos' own exposure
+    assert (
+        np.abs(photo - fast)[inside].max() < 0.02 and results[-1] is True
+    )  # the photos' own exposure
     page = np.asarray(Image.open(tmp_path / "page.png").convert("RGB"))
     assert page.shape == (460, 760, 3) and page[:, :400].std() > 3
 
@@ -165,17 +201,25 @@ def test_photo_against_render(drive, server, tmp_path):
     ]  # fmt: skip
     results = [r for r in drive(server.url, steps) if r is not None]
     assert results[0][0] is True
-    assert results[1][:2] == [False, "inset(0px 75% 0px 0px)"] and abs(results[1][2] - WIDTH / HEIGHT) < 0.02
+    assert (
+        results[1][:2] == [False, "inset(0px 75% 0px 0px)"]
+        and abs(results[1][2] - WIDTH / HEIGHT) < 0.02
+    )
     assert "25%" in results[2][1] and results[2][3] == 0  # dragged in the picture
     assert results[3][0] is True and results[3][3] == -1
     assert results[4] == 1
-    photo, rendered = (np.asarray(Image.open(tmp_path / n).convert("RGB"), np.float32)[:, :440] / 255 for n in ("photo.png", "render.png"))
+    photo, rendered = (
+        np.asarray(Image.open(tmp_path / n).convert("RGB"), np.float32)[:, :440] / 255
+        for n in ("photo.png", "render.png")
+    )
     difference = np.abs(photo - rendered)[40:420, 60:380]
     assert difference.mean() < 0.04  # they lie over one another
     assert np.abs(np.roll(photo, 12, 1) - rendered)[40:420, 60:380].mean() > 1.5 * difference.mean()
 
 
-def test_as_photographed_takes_over_exposure_and_white_balance(drive, built, reference, run_folder, tmp_path):
+def test_as_photographed_takes_over_exposure_and_white_balance(
+    drive, built, reference, run_folder, tmp_path
+):
     from relit.images import write_srgb
     from relit.viewer.serve import run_server
 
@@ -200,8 +244,16 @@ def test_a_file_that_is_no_light(drive, server, tmp_path):
     (tmp_path / "broken.exr").write_bytes(b"v/1\x01 this is no picture")
     (tmp_path / "cat.jpg").write_bytes(b"\xff\xd8")
     message = {"eval": "document.getElementById('message').textContent"}
-    steps = [READY, {"file": ["#light-file", str(tmp_path / "cat.jpg")]}, message, {"file": ["#light-file", str(tmp_path / "broken.exr")]}]
-    steps += [{"wait": "document.getElementById('message').textContent.includes('broken.exr')"}, {"eval": "relit.viewer.light.name"}]
+    steps = [
+        READY,
+        {"file": ["#light-file", str(tmp_path / "cat.jpg")]},
+        message,
+        {"file": ["#light-file", str(tmp_path / "broken.exr")]},
+    ]
+    steps += [
+        {"wait": "document.getElementById('message').textContent.includes('broken.exr')"},
+        {"eval": "relit.viewer.light.name"},
+    ]
     first, name = drive(server.url, steps)
     assert "a light is a lat-long .hdr or .exr" in first and name == "environment.exr"
 
@@ -211,7 +263,9 @@ def test_one_file_to_send(drive, run_folder, tmp_path):
 
     file = export_html(run_folder, tmp_path / "to send.html")
     inside = "relit.manifest.cameras.filter((c) => c.photo.startsWith('data:image/jpeg')).length"
-    assert drive(file.as_uri(), [READY, {"wait": "relit.viewer.tracer.count >= 1"}, {"eval": inside}]) == [3]
+    assert drive(
+        file.as_uri(), [READY, {"wait": "relit.viewer.tracer.count >= 1"}, {"eval": inside}]
+    ) == [3]
     assert [u for u in drive.fetched if not u.startswith(("file:", "data:", "blob:"))] == []
     small = export_html(run_folder, tmp_path / "small.html", photos=False)
     assert small.stat().st_size < file.stat().st_size
@@ -234,9 +288,16 @@ def test_a_run_at_work(drive, built, asset, tmp_path):
             shown = "document.querySelectorAll('.curve').length + document.querySelectorAll('.preview img').length"
             steps = [{"wait": "document.querySelector('.curve')"}, {"eval": text}, {"eval": shown}]
             said, count = drive(server.url, steps)
-            assert "cameras from photos" in said and "volume: step 100 of 400" in said and "left in this stage" in said
+            assert (
+                "cameras from photos" in said
+                and "volume: step 100 of 400" in said
+                and "left in this stage" in said
+            )
             assert count == 2
-            assert drive(server.url, [{"wait": "document.getElementById('photo').naturalWidth == 8"}]) == []
+            assert (
+                drive(server.url, [{"wait": "document.getElementById('photo').naturalWidth == 8"}])
+                == []
+            )
             save_asset(tmp_path / "run/asset", asset)
     assert drive(server.url, [READY, {"eval": "relit.manifest.title"}]) == ["mug"]
     server.shutdown()
@@ -244,7 +305,8 @@ def test_a_run_at_work(drive, built, asset, tmp_path):
 
 
 def test_copies_and_a_light_for_each_photo(drive, built, asset, run_folder, tmp_path):
-    """Two instances as the duplicates capture writes them, against Mitsuba's picture of both; a collection's lights follow the photo."""
+    """Two instances as the duplicates capture writes them, against Mitsuba's picture of both; a
+    collection's lights follow the photo."""
     from relit.conventions import move_points, similarity
     from relit.scene import Mesh
     from relit.viewer.serve import run_server
@@ -253,7 +315,10 @@ def test_copies_and_a_light_for_each_photo(drive, built, asset, run_folder, tmp_
     shutil.copytree(run_folder, run)
     beside = asset.world_from_asset @ similarity(np.diag([-1.0, 1, -1]), [0.9, 0.1, -0.3])
     poses = [asset.world_from_asset, beside]
-    listed = [{"label": i, "world_from_object": p.tolist(), "registered": True} for i, p in enumerate(poses)]
+    listed = [
+        {"label": i, "world_from_object": p.tolist(), "registered": True}
+        for i, p in enumerate(poses)
+    ]
     (run / "asset/instances.json").write_text(json.dumps({"instances": listed}))
     write_linear(run / "asset/lights/photo_0001.exr", lopsided(16)[..., [2, 0, 1]])
     server = serve(lambda: run_server(run))
@@ -280,7 +345,11 @@ def test_copies_and_a_light_for_each_photo(drive, built, asset, run_folder, tmp_
         np.concatenate([m.normals @ p[:3, :3].T for p in unit]).astype(np.float32),
         np.concatenate([m.uvs] * 2),
     )
-    wanted = render(build_scene(both, asset.material, asset.world_from_asset, asset.environment), asset.cameras[0][1], spp=128)
+    wanted = render(
+        build_scene(both, asset.material, asset.world_from_asset, asset.environment),
+        asset.cameras[0][1],
+        spp=128,
+    )
     picture = linear(values)
     assert np.abs(picture[..., 3] - wanted[..., 3]).mean() < 0.01
     assert psnr(np.clip(srgb_from_linear(picture[..., :3]), 0, 1), wanted) > 23
@@ -294,7 +363,10 @@ def test_a_model_that_is_damaged(drive, built, run_folder, tmp_path):
     whole = (run / "asset/object.glb").read_bytes()
     (run / "asset/object.glb").write_bytes(whole[: len(whole) // 2])
     server = serve(lambda: run_server(run))
-    steps = [{"wait": "document.querySelector('#message.error')"}, {"eval": "document.getElementById('message').textContent"}]
+    steps = [
+        {"wait": "document.querySelector('#message.error')"},
+        {"eval": "document.getElementById('message').textContent"},
+    ]
     (said,) = drive(server.url, steps, errors_allowed=True)
     server.shutdown()
     server.server_close()

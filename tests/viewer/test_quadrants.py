@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from looking import serve
 
-from relit.capture import open_capture
-from relit.capture.samurai import direction_of, quadrant_of, read_hints
+from relit.capture.open import open_capture
+from relit.capture.readers.samurai import direction_of, quadrant_of, read_hints
 from relit.errors import UserError
 from relit.images import write_srgb
 from relit.viewer import quadrants
@@ -41,12 +41,18 @@ def test_terminal(capture):
     hints = read_hints(path.parent, ["0.png", "2.png"])
     assert np.allclose(hints.directions["0.png"], np.array([-1, 0, 1]) / np.sqrt(2))
     assert np.allclose(hints.directions["2.png"], [0, 1, 0])
-    ask_in_terminal(capture, lambda text: "d" if text.startswith("1.png (1 of 1)") else pytest.fail(text), said.append)  # only what is left
+    ask_in_terminal(
+        capture,
+        lambda text: "d" if text.startswith("1.png (1 of 1)") else pytest.fail(text),
+        said.append,
+    )  # only what is left
     assert len(json.loads(path.read_text())["frames"]) == 3
 
 
 def test_photos_that_are_set_aside_are_asked_for_among_the_others(capture):
-    aside = replace(capture, photos=capture.photos[:1] + capture.photos[2:], held_out=capture.photos[1:2])
+    aside = replace(
+        capture, photos=capture.photos[:1] + capture.photos[2:], held_out=capture.photos[1:2]
+    )
     asked = []
     ask_in_terminal(aside, lambda text: asked.append(text.split()[0]) or "a", lambda _: None)
     assert [Path(name).name for name in asked] == ["0.png", "1.png", "2.png"]
@@ -61,16 +67,23 @@ def test_directions_and_answers_are_inverse():
 
 def test_guesses_of_a_finished_run(capture, tmp_path):
     from relit.asset.asset import cameras_to_json
-    from relit.cameras.se3 import look_at
+    from relit.geometry.se3 import look_at
     from relit.scene import Camera
 
     eyes = {"0.png": [-2.0, 0, 2], "1.png": [0, 3.0, 0.1], "2.png": [2.0, 0, -0.1]}
-    cameras = [(f"image/{n}", Camera(30, 20, 40.0, 40.0, 15.0, 10.0, look_at(np.array(e)))) for n, e in eyes.items()]
+    cameras = [
+        (f"image/{n}", Camera(30, 20, 40.0, 40.0, 15.0, 10.0, look_at(np.array(e))))
+        for n, e in eyes.items()
+    ]
     (tmp_path / "run" / "asset").mkdir(parents=True)
     (tmp_path / "run" / "asset" / "cameras.json").write_text(json.dumps(cameras_to_json(cameras)))
     (tmp_path / "run" / "asset" / "asset.json").write_text("{}")
     guesses = guesses_of(tmp_path / "run")
-    assert guesses == {"0.png": ["Left", "Center", "Front"], "1.png": ["Center", "Above", "Center"], "2.png": ["Right", "Center", "Center"]}
+    assert guesses == {
+        "0.png": ["Left", "Center", "Front"],
+        "1.png": ["Center", "Above", "Center"],
+        "2.png": ["Right", "Center", "Center"],
+    }
     typed = {"0.png": "", "1.png": "b", "2.png": "q"}  # Enter takes the guess
     path = ask_in_terminal(capture, lambda text: typed[text.split()[0]], lambda _: None, guesses)
     said = {f["image_name"]: f["quadrant"] for f in json.loads(path.read_text())["frames"]}
@@ -78,10 +91,16 @@ def test_guesses_of_a_finished_run(capture, tmp_path):
 
 
 def test_the_page_begins_with_the_guesses(built, capture):
-    guesses = {"0.png": ["Left", "Center", "Front"], "1.png": ["Center", "Above", "Center"], "2.png": ["Right", "Center", "Center"]}
+    guesses = {
+        "0.png": ["Left", "Center", "Front"],
+        "1.png": ["Center", "Above", "Center"],
+        "2.png": ["Right", "Center", "Center"],
+    }
     server = quadrant_server(capture, guesses=guesses)
     try:
-        assert [p["guess"] for p in server.answers["quadrants"]()["photos"]] == list(guesses.values())
+        assert [p["guess"] for p in server.answers["quadrants"]()["photos"]] == list(
+            guesses.values()
+        )
     finally:
         server.server_close()
 
@@ -102,7 +121,11 @@ def test_page(built, capture):
 
         assert post({"i": 1, "keys": "sb"})["answer"] == ["Center", "Below", "Back"]
         with urlopen(server.url + "quadrants") as reply:
-            assert [p["answer"] for p in json.load(reply)["photos"]] == [None, ["Center", "Below", "Back"], None]
+            assert [p["answer"] for p in json.load(reply)["photos"]] == [
+                None,
+                ["Center", "Below", "Back"],
+                None,
+            ]
         with pytest.raises(OSError, match="422"):
             post({"i": 1, "keys": ""})
     finally:
@@ -111,7 +134,8 @@ def test_page(built, capture):
 
 
 def test_answering_in_a_browser(drive, capture, monkeypatch):
-    """By keys; a photo that takes long to load shows nothing until it is there, and never the one before."""
+    """By keys; a photo that takes long to load shows nothing until it is there, and never the one
+    before."""
     encode = quadrants.encode_jpeg
     monkeypatch.setattr(quadrants, "encode_jpeg", lambda rgb: (time.sleep(0.8), encode(rgb))[1])
     server = serve(lambda: quadrants.quadrant_server(capture))
@@ -155,4 +179,8 @@ def test_answering_in_a_browser(drive, capture, monkeypatch):
     assert results[2].startswith("All answered")
     assert results[3] == ["photo.jpg?i=1", 30], "a photo that was there is there at once"
     answers = json.loads((capture.folder / "quadrants.json").read_text())["frames"]
-    assert [f["quadrant"] for f in answers] == [["Right", "Above", "Center"], ["Right", "Center", "Back"], ["Center", "Center", "Front"]]
+    assert [f["quadrant"] for f in answers] == [
+        ["Right", "Above", "Center"],
+        ["Right", "Center", "Back"],
+        ["Center", "Center", "Front"],
+    ]

@@ -1,4 +1,5 @@
-"""The local server: loopback only, one folder, no foreign hosts or origins; and what the page is told."""
+"""The local server: loopback only, one folder, no foreign hosts or origins; and what the page is
+told."""
 
 from __future__ import annotations
 
@@ -44,7 +45,11 @@ def test_it_listens_on_loopback_only(server):
 
 def test_what_it_serves(server, run_folder):
     code, page, headers = ask(server, "/")
-    assert code == 200 and b"relit-manifest" in page and "default-src 'none'" in headers["Content-Security-Policy"]
+    assert (
+        code == 200
+        and b"relit-manifest" in page
+        and "default-src 'none'" in headers["Content-Security-Policy"]
+    )
     assert not any(key.lower().startswith("access-control") for key in headers)
     code, text, _ = ask(server, "/manifest.json")
     found = json.loads(text)
@@ -73,10 +78,19 @@ def test_foreign_hosts_and_origins_are_refused(server):
     ):
         for path in ("/", "/manifest.json", "/files/asset/object.glb"):
             assert ask(server, path, **headers)[0] == 403, (path, headers)
-    for headers in ({"Host": f"localhost:{port}"}, {"Origin": f"http://127.0.0.1:{port}"}, {"Sec_Fetch_Site": "same-origin"}):
+    for headers in (
+        {"Host": f"localhost:{port}"},
+        {"Origin": f"http://127.0.0.1:{port}"},
+        {"Sec_Fetch_Site": "same-origin"},
+    ):
         assert ask(server, "/manifest.json", **headers)[0] == 200
     assert ask(server, "/anything", method="POST", body=b"{}")[0] == 403
-    assert ask(server, "/manifest.json", method="POST", body=b"{}", Origin=f"http://127.0.0.1:{port}")[0] == 403
+    assert (
+        ask(server, "/manifest.json", method="POST", body=b"{}", Origin=f"http://127.0.0.1:{port}")[
+            0
+        ]
+        == 403
+    )
     assert ask(server, "/", method="DELETE")[0] == 501
 
 
@@ -104,7 +118,9 @@ def test_nothing_outside_the_folder(server, run_folder):
             "x" * 5000,
         ):
             code, content, _ = ask(server, "/files/" + name)
-            assert code in (403, 404) and b"outside" not in content and b"root:" not in content, name
+            assert code in (403, 404) and b"outside" not in content and b"root:" not in content, (
+                name
+            )
         assert ask(server, "/files/leads-in")[0] == 200
     finally:
         link.unlink()
@@ -124,7 +140,10 @@ def test_folders_that_are_no_run(built, tmp_path, run_folder):
     broken = tmp_path / "broken"
     shutil.copytree(run_folder, broken)
     head = json.loads((broken / "asset/asset.json").read_text())
-    for spoilt in ({**head, "world_from_asset": "north"}, {**head, "world_from_asset": [[1, 2], [3, 4]]}):
+    for spoilt in (
+        {**head, "world_from_asset": "north"},
+        {**head, "world_from_asset": [[1, 2], [3, 4]]},
+    ):
         (broken / "asset/asset.json").write_text(json.dumps(spoilt))
         with pytest.raises(UserError, match="world_from_asset"):
             run_server(broken)
@@ -136,9 +155,15 @@ def test_folders_that_are_no_run(built, tmp_path, run_folder):
 
 def test_data_that_would_end_the_script(built):
     text = page_with({"title": "</script><script>alert(1)</script><!--"})
-    assert text.count("</script>") == page_text().count("</script>") and "alert(1)</script>" not in text
+    assert (
+        text.count("</script>") == page_text().count("</script>")
+        and "alert(1)</script>" not in text
+    )
     start = text.index(">", text.index('id="relit-manifest"')) + 1
-    assert json.loads(text[start : text.index("</script>", start)])["title"] == "</script><script>alert(1)</script><!--"
+    assert (
+        json.loads(text[start : text.index("</script>", start)])["title"]
+        == "</script><script>alert(1)</script><!--"
+    )
     assert SLOT not in text
 
 
@@ -146,7 +171,9 @@ def test_names_in_the_index_cannot_leave_the_folder(run_folder, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(run_folder, run)
     (tmp_path / "secret.jpg").write_bytes(b"secret")
-    (run / "photos/index.json").write_text(json.dumps({"photos": {"images/p0.png": "../../secret.jpg", "images/p1.png": 3}}))
+    (run / "photos/index.json").write_text(
+        json.dumps({"photos": {"images/p0.png": "../../secret.jpg", "images/p1.png": 3}})
+    )
     assert [c["photo"] for c in manifest(run, data_uri, live=False)["cameras"]] == [None] * 3
 
 
@@ -154,13 +181,22 @@ def test_instances_lights_and_flash_are_told(run_folder, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(run_folder, run)
     pose = np.eye(4).tolist()
-    listed = [{"label": 1, "world_from_object": pose}, {"label": 2, "world_from_object": pose, "registered": False}, {"label": 3}]
+    listed = [
+        {"label": 1, "world_from_object": pose},
+        {"label": 2, "world_from_object": pose, "registered": False},
+        {"label": 3},
+    ]
     (run / "asset/instances.json").write_text(json.dumps({"instances": listed}))
-    (run / "asset/lights/flash.json").write_text(json.dumps({"offset": [0, 0, 0], "intensity": [1, 1, 1]}))
+    (run / "asset/lights/flash.json").write_text(
+        json.dumps({"offset": [0, 0, 0], "intensity": [1, 1, 1]})
+    )
     shutil.copy(run / "asset/lights/environment.exr", run / "asset/lights/photo_0001.exr")
     found = manifest(run, lambda p: p.name, live=False)
     assert found["asset"]["instances"] == [pose] and found["flash"]["offset"] == [0, 0, 0]
-    assert [(light["url"], light["photo"]) for light in found["lights"]] == [("environment.exr", None), ("photo_0001.exr", 1)]
+    assert [(light["url"], light["photo"]) for light in found["lights"]] == [
+        ("environment.exr", None),
+        ("photo_0001.exr", 1),
+    ]
 
 
 def test_status_of_a_run(tmp_path):
@@ -173,11 +209,18 @@ def test_status_of_a_run(tmp_path):
         assert said["now"]["left"] == pytest.approx(said["now"]["seconds"])
     run.close()
     said = status(tmp_path / "run", lambda p: p.name)
-    assert not said["running"] and said["now"] is None and [s["name"] for s in said["stages"]] == ["volume"]
+    assert (
+        not said["running"]
+        and said["now"] is None
+        and [s["name"] for s in said["stages"]] == ["volume"]
+    )
 
 
 def test_long_curves_are_thinned():
-    records = [{"stage": "s", "step": i, "of": 5000, "seconds": 1.0, "image": 1.0, "bad": None} for i in range(5000)]
+    records = [
+        {"stage": "s", "step": i, "of": 5000, "seconds": 1.0, "image": 1.0, "bad": None}
+        for i in range(5000)
+    ]
     (only,) = curves(records)
     assert only["name"] == "image" and 100 <= len(only["points"]) <= 200
 

@@ -1,4 +1,4 @@
-// The path tracer of the page: the BRDF of relit.materials.brdf and the estimator of relit.rendering.path, sample by sample.
+// The path tracer of the page: the BRDF of relit.materials.brdf and the estimator of relit.reference.path, sample by sample.
 // One sample a pixel and call; the sums of all calls are kept in a float target (tracer.js).
 import { BVHShaderGLSL } from "three-mesh-bvh";
 
@@ -20,7 +20,7 @@ ${BVHShaderGLSL.bvh_ray_functions}
 const float PI = 3.14159265358979;
 const float MIN_ALPHA = 0.0064;
 const float MIN_COS = 0.02;
-const float MAX_SHIFT = 0.05; // of the triangle's longest edge, see relit.rendering.path
+const float MAX_SHIFT = 0.05; // of the triangle's longest edge, see relit.reference.path
 const int TABLE = 32;
 
 uniform BVH bvh;

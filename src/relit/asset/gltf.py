@@ -23,10 +23,12 @@ VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 
 
 def read_asset_file(path: str | Path, nodes=()) -> tuple[Mesh, Material]:
-    """Mesh and material of a .glb, .gltf or .obj file, in the file's coordinates after its node transforms.
+    """Mesh and material of a .glb, .gltf or .obj file, in the file's coordinates after its node
+    transforms.
 
-    Factors are multiplied into the textures, several primitives become one mesh, several materials one atlas. Vertex colours,
-    occlusion and emission are ignored. nodes: names of the glTF nodes whose meshes are taken; all where empty.
+    Factors are multiplied into the textures, several primitives become one mesh, several materials
+    one atlas. Vertex colours, occlusion and emission are ignored. nodes: names of the glTF nodes
+    whose meshes are taken; all where empty.
     Raises UserError for a missing, damaged or unsupported file.
     """
     path = Path(path)
@@ -34,13 +36,19 @@ def read_asset_file(path: str | Path, nodes=()) -> tuple[Mesh, Material]:
         raise UserError("the model file does not exist", fix=f"check the path: {path}")
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
-        with np.errstate(all="ignore"):  # damaged files: values that are not finite are refused at the end
+        with np.errstate(
+            all="ignore"
+        ):  # damaged files: values that are not finite are refused at the end
             return read_gltf(path, tuple(nodes))
     if suffix == ".obj":
         if nodes:
-            raise UserError("an OBJ file has no nodes to choose", fix=f"give none, or a .glb: {path}")
+            raise UserError(
+                "an OBJ file has no nodes to choose", fix=f"give none, or a .glb: {path}"
+            )
         return read_obj(path)
-    raise UserError(f"'{suffix}' is not a model format that can be read", fix=f"use .glb, .gltf or .obj: {path}")
+    raise UserError(
+        f"'{suffix}' is not a model format that can be read", fix=f"use .glb, .gltf or .obj: {path}"
+    )
 
 
 # ---------------------------------------------------------------- writing
@@ -85,7 +93,9 @@ class _Document:
 
     def texture(self, png: bytes) -> dict:
         images, textures = self.json.setdefault("images", []), self.json.setdefault("textures", [])
-        self.json.setdefault("samplers", [{"magFilter": 9729, "minFilter": 9987, "wrapS": 10497, "wrapT": 10497}])
+        self.json.setdefault(
+            "samplers", [{"magFilter": 9729, "minFilter": 9987, "wrapS": 10497, "wrapT": 10497}]
+        )
         images.append({"bufferView": self.view(png), "mimeType": "image/png"})
         textures.append({"source": len(images) - 1, "sampler": 0})
         return {"index": len(textures) - 1}
@@ -105,7 +115,8 @@ class _Document:
 
 
 def _constant(a: np.ndarray) -> bool:
-    """True where an array (H, W[, C]) has one value (per channel) all over: it becomes a factor, not a texture."""
+    """True where an array (H, W[, C]) has one value (per channel) all over: it becomes a factor,
+    not a texture."""
     a = np.asarray(a)
     return bool(np.all(a == a[:1, :1]))
 
@@ -117,7 +128,8 @@ def _data_png(array: np.ndarray) -> bytes:
 
 
 def _pbr(doc: _Document, m: Material) -> dict:
-    """pbrMetallicRoughness of a material: G is the roughness, B the metallic of one packed texture (glTF 2.0, Sec. 3.9.2)."""
+    """pbrMetallicRoughness of a material: G is the roughness, B the metallic of one packed texture
+    (glTF 2.0, Sec. 3.9.2)."""
     p: dict = {}
     if _constant(m.base_color):
         p["baseColorFactor"] = [*np.clip(m.base_color[0, 0], 0, 1).astype(float).tolist(), 1.0]
@@ -126,11 +138,18 @@ def _pbr(doc: _Document, m: Material) -> dict:
     planes = []
     for key, plane in (("roughnessFactor", m.roughness), ("metallicFactor", m.metallic)):
         p[key] = float(np.clip(plane[0, 0], 0, 1)) if _constant(plane) else 1.0
-        planes.append(np.ones((1, 1), np.float32) if _constant(plane) else np.asarray(plane, np.float32))
+        planes.append(
+            np.ones((1, 1), np.float32) if _constant(plane) else np.asarray(plane, np.float32)
+        )
     size = np.max([x.shape for x in planes], axis=0)
     if size.max() > 1:
-        g, b = (x if x.shape == tuple(size) else cv2.resize(x, (int(size[1]), int(size[0]))) for x in planes)
-        p["metallicRoughnessTexture"] = doc.texture(_data_png(np.stack([np.ones_like(g), g, b], -1)))
+        g, b = (
+            x if x.shape == tuple(size) else cv2.resize(x, (int(size[1]), int(size[0])))
+            for x in planes
+        )
+        p["metallicRoughnessTexture"] = doc.texture(
+            _data_png(np.stack([np.ones_like(g), g, b], -1))
+        )
     return p
 
 
@@ -142,37 +161,64 @@ def has_border(mesh: Mesh) -> bool:
     return bool((np.unique(sides, axis=0, return_counts=True)[1] == 1).any())
 
 
-def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=None, name: str = "object", instances=()) -> None:
-    """Write a binary glTF 2.0 file, atomically: one node, one primitive, NORMAL always, TANGENT with a normal map. An open mesh (of photos
-    without masks) is doubleSided.
+def write_glb(
+    path: str | Path,
+    mesh: Mesh,
+    material: Material,
+    root_transform=None,
+    name: str = "object",
+    instances=(),
+) -> None:
+    """Write a binary glTF 2.0 file, atomically: one node, one primitive, NORMAL always, TANGENT
+    with a normal map. An open mesh (of photos without masks) is doubleSided.
 
-    root_transform: (4, 4) matrix of the node, or None: the file's coordinates are root_transform @ mesh. Textures are 8-bit PNGs
-    (base colour and specular colour in sRGB); an array with one value becomes a factor. Material.specular becomes specularColor of
-    KHR_materials_specular, an ior other than 1.5 becomes KHR_materials_ior. instances: (name, (4, 4)) pairs, one node for each, all with
-    the same mesh.
+    root_transform: (4, 4) matrix of the node, or None: the file's coordinates are root_transform @
+    mesh. Textures are 8-bit PNGs (base colour and specular colour in sRGB); an array with one value
+    becomes a factor. Material.specular becomes specularColor of KHR_materials_specular, an ior
+    other than 1.5 becomes KHR_materials_ior. instances: (name, (4, 4)) pairs, one node for each,
+    all with the same mesh.
     """
     if len(mesh.faces) == 0:
-        raise UserError("an empty mesh cannot be exported", "the reconstruction has no surface", f"look at its stages before: {path}")
+        raise UserError(
+            "an empty mesh cannot be exported",
+            "the reconstruction has no surface",
+            f"look at its stages before: {path}",
+        )
     if mesh.uvs is None:
-        mapped = [material.base_color, material.roughness, material.metallic, material.specular, material.normal]
+        mapped = [
+            material.base_color,
+            material.roughness,
+            material.metallic,
+            material.specular,
+            material.normal,
+        ]
         if any(a is not None and not _constant(a) for a in mapped):
             raise UserError(
-                "a textured material needs a mesh with texture coordinates", fix="unwrap the mesh first, or use constant textures"
+                "a textured material needs a mesh with texture coordinates",
+                fix="unwrap the mesh first, or use constant textures",
             )
         material = replace(material, normal=None)
     doc = _Document(name)
     if root_transform is not None and not np.allclose(root_transform, np.eye(4), atol=1e-12):
         doc.json["nodes"][0]["matrix"] = np.asarray(root_transform, np.float64).T.ravel().tolist()
     if instances:
-        nodes = [{"mesh": 0, "name": n, "matrix": np.asarray(m, np.float64).T.ravel().tolist()} for n, m in instances]
+        nodes = [
+            {"mesh": 0, "name": n, "matrix": np.asarray(m, np.float64).T.ravel().tolist()}
+            for n, m in instances
+        ]
         doc.json["nodes"], doc.json["scenes"] = nodes, [{"nodes": list(range(len(nodes)))}]
-    normals = np.asarray(mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64)
+    normals = np.asarray(
+        mesh.normals if mesh.normals is not None else vertex_normals(mesh), np.float64
+    )
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     if (length < 1e-6).any():
         normals = np.where(length < 1e-6, vertex_normals(mesh), normals)
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
     mesh = replace(mesh, normals=(normals / length).astype(np.float32))
-    attributes = {"POSITION": doc.accessor(mesh.vertices, bounds=True), "NORMAL": doc.accessor(mesh.normals)}
+    attributes = {
+        "POSITION": doc.accessor(mesh.vertices, bounds=True),
+        "NORMAL": doc.accessor(mesh.normals),
+    }
     m: dict = {"name": name, "pbrMetallicRoughness": _pbr(doc, material)}
     if has_border(mesh):
         m["doubleSided"] = True
@@ -188,11 +234,22 @@ def write_glb(path: str | Path, mesh: Mesh, material: Material, root_transform=N
         s = np.repeat(s[..., None], 3, -1) if s.ndim == 2 else s
         top = max(float(s.max()), 1e-6)
         if _constant(s):
-            doc.extension(m, "KHR_materials_specular", {"specularColorFactor": s[0, 0].astype(float).tolist()})
+            doc.extension(
+                m, "KHR_materials_specular", {"specularColorFactor": s[0, 0].astype(float).tolist()}
+            )
         else:
             texture = doc.texture(encode_png(s / top))
-            doc.extension(m, "KHR_materials_specular", {"specularColorFactor": [top] * 3, "specularColorTexture": texture})
+            doc.extension(
+                m,
+                "KHR_materials_specular",
+                {"specularColorFactor": [top] * 3, "specularColorTexture": texture},
+            )
     indices = doc.accessor(np.asarray(mesh.faces).ravel())
     doc.json["materials"].append(m)
-    doc.json["meshes"].append({"name": name, "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]})
+    doc.json["meshes"].append(
+        {
+            "name": name,
+            "primitives": [{"attributes": attributes, "indices": indices, "material": 0}],
+        }
+    )
     write_bytes(path, doc.bytes())

@@ -24,7 +24,12 @@ MAX_BYTES = 2 << 30
 MAX_TEXELS = 128_000_000  # of one texture
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-UNDERSTOOD = {"KHR_materials_ior", "KHR_materials_specular", "KHR_texture_transform", "KHR_mesh_quantization"}
+UNDERSTOOD = {
+    "KHR_materials_ior",
+    "KHR_materials_specular",
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+}
 
 
 def _size(data: bytes) -> tuple[int, int] | None:
@@ -53,7 +58,10 @@ class _File:
             if data[:4] == b"glTF":
                 _, version, _ = struct.unpack_from("<4sII", data)
                 if version != 2:
-                    raise UserError(f"glTF version {version} is not supported", fix=f"convert it to glTF 2.0: {path}")
+                    raise UserError(
+                        f"glTF version {version} is not supported",
+                        fix=f"convert it to glTF 2.0: {path}",
+                    )
                 size, _ = struct.unpack_from("<II", data, 12)
                 self.json = json.loads(data[20 : 20 + size])
                 at = 20 + size
@@ -63,7 +71,9 @@ class _File:
             else:
                 self.json = json.loads(data)
         except (ValueError, struct.error, RecursionError) as e:
-            raise UserError("this is not a readable glTF file", str(e), f"export it again: {path}") from None
+            raise UserError(
+                "this is not a readable glTF file", str(e), f"export it again: {path}"
+            ) from None
         unknown = set(self.json.get("extensionsRequired", [])) - UNDERSTOOD
         if unknown:
             raise UserError(
@@ -71,7 +81,11 @@ class _File:
                 fix=f"export it without them: {path}",
             )
         if not isinstance(self.json, dict):
-            raise UserError("this is not a readable glTF file", "its JSON is no object", f"export it again: {path}")
+            raise UserError(
+                "this is not a readable glTF file",
+                "its JSON is no object",
+                f"export it again: {path}",
+            )
         self.buffers: dict[int, bytes] = {}
         self.images: dict[int, np.ndarray] = {}
 
@@ -80,9 +94,14 @@ class _File:
             return base64.b64decode(uri.split(",", 1)[1])
         file = inside(self.path.parent, unquote(uri))
         if not file.is_file():
-            raise UserError("a file that the model refers to is missing", fix=f"put it beside the model: {file}")
+            raise UserError(
+                "a file that the model refers to is missing", fix=f"put it beside the model: {file}"
+            )
         if file.stat().st_size > MAX_BYTES:
-            raise UserError("a file that the model refers to is larger than 2 GB", fix=f"make it smaller: {file}")
+            raise UserError(
+                "a file that the model refers to is larger than 2 GB",
+                fix=f"make it smaller: {file}",
+            )
         return file.read_bytes()
 
     def view(self, index: int) -> tuple[bytes, int]:
@@ -93,7 +112,12 @@ class _File:
             uri = self.json["buffers"][b].get("uri")
             self.buffers[b] = self.resource(uri) if uri else (self.chunk or b"")
         start, length, stride = v.get("byteOffset", 0), v["byteLength"], v.get("byteStride", 0)
-        if not (start >= 0 and length >= 0 and 0 <= stride <= 252 and start + length <= len(self.buffers[b])):
+        if not (
+            start >= 0
+            and length >= 0
+            and 0 <= stride <= 252
+            and start + length <= len(self.buffers[b])
+        ):
             raise ValueError("a buffer view lies outside its buffer")
         return self.buffers[b][start : start + length], stride
 
@@ -101,7 +125,10 @@ class _File:
         """(count, width) array; normalised integers become floats."""
         a = self.json["accessors"][index]
         if "sparse" in a:
-            raise UserError("sparse accessors are not supported", fix=f"export the model without them: {self.path}")
+            raise UserError(
+                "sparse accessors are not supported",
+                fix=f"export the model without them: {self.path}",
+            )
         dtype, width = np.dtype(COMPONENTS[a["componentType"]]), WIDTHS[a["type"]]
         if "bufferView" not in a:
             return np.zeros((a["count"], width), dtype)
@@ -120,32 +147,50 @@ class _File:
         index = self.json["textures"][texture["index"]].get("source")
         if index is None:
             raise UserError(
-                "a texture has no PNG or JPEG image", "other image formats are not supported", f"export it with PNG images: {self.path}"
+                "a texture has no PNG or JPEG image",
+                "other image formats are not supported",
+                f"export it with PNG images: {self.path}",
             )
         if index not in self.images:
             entry = self.json["images"][index]
-            data = self.resource(entry["uri"]) if "uri" in entry else self.view(entry["bufferView"])[0]
+            data = (
+                self.resource(entry["uri"]) if "uri" in entry else self.view(entry["bufferView"])[0]
+            )
             self.images[index] = decode_image(data, str(self.path))
         return self.images[index]
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The file `name` in `folder` or below. Raises UserError for one that lies elsewhere: a model must not read the user's other files."""
+    """The file `name` in `folder` or below. Raises UserError for one that lies elsewhere: a model
+    must not read the user's other files."""
     file = folder / name
     if "\0" in name or not file.resolve().is_relative_to(folder.resolve()):
-        raise UserError("the model refers to a file outside its folder", "such files are not read", f"put it beside the model: {file}")
+        raise UserError(
+            "the model refers to a file outside its folder",
+            "such files are not read",
+            f"put it beside the model: {file}",
+        )
     return file
 
 
 def decode_image(data: bytes, name: str) -> np.ndarray:
-    """PNG or JPEG bytes -> (H, W, C) float32 in [0, 1], channels in RGB order, no transfer curve removed."""
+    """PNG or JPEG bytes -> (H, W, C) float32 in [0, 1], channels in RGB order, no transfer curve
+    removed."""
     size = _size(data)
     if size is not None and size[0] * size[1] > MAX_TEXELS:
         what = f"a texture of {size[0]} x {size[1]} pixels is too large"
-        raise UserError(what, f"at most {MAX_TEXELS // 10**6} million pixels are read", f"make it smaller: {name}")
+        raise UserError(
+            what,
+            f"at most {MAX_TEXELS // 10**6} million pixels are read",
+            f"make it smaller: {name}",
+        )
     a = decode_bytes(data, cv2.IMREAD_UNCHANGED)
     if a is None:
-        raise UserError("a texture cannot be decoded", "it is neither PNG nor JPEG, or it is damaged", f"export it again: {name}")
+        raise UserError(
+            "a texture cannot be decoded",
+            "it is neither PNG nor JPEG, or it is damaged",
+            f"export it again: {name}",
+        )
     a = a[..., None] if a.ndim == 2 else a
     out = a.astype(np.float32) / (np.iinfo(a.dtype).max if a.dtype.kind == "u" else 1.0)
     return out[..., [2, 1, 0, *range(3, a.shape[2])]] if a.shape[2] >= 3 else out
@@ -156,35 +201,62 @@ def _rgb(image: np.ndarray) -> np.ndarray:
 
 
 def _material(file: _File, index: int | None) -> tuple[Material, int, dict]:
-    """Material, TEXCOORD set and texture transform of a glTF material (the default one for None)."""
+    """Material, TEXCOORD set and texture transform of a glTF material (the default one for
+    None)."""
     m = file.json["materials"][index] if index is not None else {}
     p = m.get("pbrMetallicRoughness", {})
     ext = m.get("extensions", {})
-    used = [x for x in (p.get("baseColorTexture"), p.get("metallicRoughnessTexture"), m.get("normalTexture")) if x]
+    used = [
+        x
+        for x in (
+            p.get("baseColorTexture"),
+            p.get("metallicRoughnessTexture"),
+            m.get("normalTexture"),
+        )
+        if x
+    ]
     uses = {
-        (x.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", x.get("texCoord", 0)), _transform_key(x)) for x in used
+        (
+            x.get("extensions", {})
+            .get("KHR_texture_transform", {})
+            .get("texCoord", x.get("texCoord", 0)),
+            _transform_key(x),
+        )
+        for x in used
     }
     if len(uses) > 1:
-        raise UserError("the textures of one material use different texture coordinates", fix=f"bake them to one set: {file.path}")
+        raise UserError(
+            "the textures of one material use different texture coordinates",
+            fix=f"bake them to one set: {file.path}",
+        )
     texcoord, transform = next(iter(uses), (0, ()))
 
-    base = np.asarray(p.get("baseColorFactor", [1, 1, 1, 1]), np.float32)[:3] * np.ones((1, 1, 3), np.float32)
+    base = np.asarray(p.get("baseColorFactor", [1, 1, 1, 1]), np.float32)[:3] * np.ones(
+        (1, 1, 3), np.float32
+    )
     if "baseColorTexture" in p:
         base = base * linear_from_srgb(_rgb(file.image(p["baseColorTexture"])))
-    rough, metal = np.full((1, 1), p.get("roughnessFactor", 1.0), np.float32), np.full((1, 1), p.get("metallicFactor", 1.0), np.float32)
+    rough, metal = (
+        np.full((1, 1), p.get("roughnessFactor", 1.0), np.float32),
+        np.full((1, 1), p.get("metallicFactor", 1.0), np.float32),
+    )
     if "metallicRoughnessTexture" in p:
         image = _rgb(file.image(p["metallicRoughnessTexture"]))
         rough, metal = rough * image[..., 1], metal * image[..., 2]  # glTF 2.0, Sec. 3.9.2: G and B
     normal = None
     if "normalTexture" in m:
         scale = m["normalTexture"].get("scale", 1.0)
-        normal = (_rgb(file.image(m["normalTexture"])) * 2 - 1) * np.array([scale, scale, 1], np.float32)
+        normal = (_rgb(file.image(m["normalTexture"])) * 2 - 1) * np.array(
+            [scale, scale, 1], np.float32
+        )
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     specular = None
     if "KHR_materials_specular" in ext:
         s = ext["KHR_materials_specular"]
         specular = (
-            s.get("specularFactor", 1.0) * np.asarray(s.get("specularColorFactor", [1, 1, 1]), np.float32) * np.ones((1, 1, 3), np.float32)
+            s.get("specularFactor", 1.0)
+            * np.asarray(s.get("specularColorFactor", [1, 1, 1]), np.float32)
+            * np.ones((1, 1, 3), np.float32)
         )
         if "specularTexture" in s:
             image = file.image(s["specularTexture"])
@@ -198,12 +270,20 @@ def _material(file: _File, index: int | None) -> tuple[Material, int, dict]:
             specular = None
     ior = float(ext.get("KHR_materials_ior", {}).get("ior", 1.5))
     f = lambda a: None if a is None else np.ascontiguousarray(a, np.float32)  # noqa: E731
-    return Material(f(base), f(rough), f(metal), ior, f(specular), f(normal)), texcoord, dict(transform)
+    return (
+        Material(f(base), f(rough), f(metal), ior, f(specular), f(normal)),
+        texcoord,
+        dict(transform),
+    )
 
 
 def _transform_key(texture: dict) -> tuple:
     t = texture.get("extensions", {}).get("KHR_texture_transform", {})
-    return tuple((k, tuple(t[k]) if isinstance(t[k], list) else t[k]) for k in ("offset", "rotation", "scale") if k in t)
+    return tuple(
+        (k, tuple(t[k]) if isinstance(t[k], list) else t[k])
+        for k in ("offset", "rotation", "scale")
+        if k in t
+    )
 
 
 def _transformed(uv: np.ndarray, t: dict) -> np.ndarray:
@@ -230,12 +310,17 @@ def _local(node: dict) -> np.ndarray:
     return out
 
 
-def _parts(file: _File, primitive: dict, asset_from_node: np.ndarray, materials: dict) -> Part | None:
+def _parts(
+    file: _File, primitive: dict, asset_from_node: np.ndarray, materials: dict
+) -> Part | None:
     mode = primitive.get("mode", 4)
     if mode < 4:
         return None  # points and lines have no surface
     if mode != 4:
-        raise UserError("triangle strips and fans are not supported", fix=f"export the model as plain triangles: {file.path}")
+        raise UserError(
+            "triangle strips and fans are not supported",
+            fix=f"export the model as plain triangles: {file.path}",
+        )
     attributes = primitive["attributes"]
     v = file.accessor(attributes["POSITION"]).astype(np.float64)
     if "indices" in primitive:
@@ -243,7 +328,10 @@ def _parts(file: _File, primitive: dict, asset_from_node: np.ndarray, materials:
     else:
         faces = np.arange(len(v), dtype=np.int32).reshape(-1, 3)
     if len(faces) and (faces.max() >= len(v) or faces.min() < 0):
-        raise UserError("the model's triangles refer to vertices that are not there", fix=f"export it again: {file.path}")
+        raise UserError(
+            "the model's triangles refer to vertices that are not there",
+            fix=f"export it again: {file.path}",
+        )
     key = primitive.get("material")
     if key not in materials:
         materials[key] = _material(file, key)
@@ -263,14 +351,19 @@ def _parts(file: _File, primitive: dict, asset_from_node: np.ndarray, materials:
 
 
 def read_gltf(path: Path, nodes: tuple[str, ...] = ()) -> tuple[Mesh, Material]:
-    """Mesh in the coordinates after the node transforms, and its material. Vertex colours, occlusion and emission are ignored.
+    """Mesh in the coordinates after the node transforms, and its material. Vertex colours,
+    occlusion and emission are ignored.
 
     nodes: names of the nodes whose meshes are taken; all where empty."""
     file = _File(path)
     doc = file.json
     parts, materials, names = [], {}, set()
     try:
-        scene = doc["scenes"][doc.get("scene", 0)] if doc.get("scenes") else {"nodes": list(range(len(doc["nodes"])))}
+        scene = (
+            doc["scenes"][doc.get("scene", 0)]
+            if doc.get("scenes")
+            else {"nodes": list(range(len(doc["nodes"])))}
+        )
         stack = [(n, np.eye(4), 0) for n in reversed(scene.get("nodes", []))]
         while stack:
             index, asset_from_parent, depth = stack.pop()
@@ -283,11 +376,23 @@ def read_gltf(path: Path, nodes: tuple[str, ...] = ()) -> tuple[Mesh, Material]:
             for primitive in doc["meshes"][node["mesh"]]["primitives"] if taken else []:
                 parts.append(_parts(file, primitive, asset_from_node, materials))
             stack += [(c, asset_from_node, depth + 1) for c in reversed(node.get("children", []))]
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError, MemoryError) as e:
-        raise UserError("the glTF file is damaged", f"{type(e).__name__}: {e}", f"export it again: {path}") from None
+    except (
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ArithmeticError,
+        MemoryError,
+    ) as e:
+        raise UserError(
+            "the glTF file is damaged", f"{type(e).__name__}: {e}", f"export it again: {path}"
+        ) from None
     missing = [n for n in nodes if n not in names]
     if missing:
         raise UserError(
-            f"the model has no node '{missing[0]}' with a mesh", f"it has: {', '.join(sorted(names))}", f"choose of these: {path}"
+            f"the model has no node '{missing[0]}' with a mesh",
+            f"it has: {', '.join(sorted(names))}",
+            f"choose of these: {path}",
         )
     return merge_parts([p for p in parts if p is not None and len(p.faces)], path)

@@ -1,10 +1,13 @@
-"""The instances of a photo of duplicates in the asset folder: `instances.json`, and `scene.glb` with one node for each of them.
+"""The instances of a photo of duplicates in the asset folder: `instances.json`, and `scene.glb`
+with one node for each of them.
 
-    {"instances": [{"label": 42, "world_from_object": 4x4, "registered": true}, {"label": 85, "registered": false, "reason": "..."}],
-     "ground": {"point": [x, y, z], "normal": [x, y, z], "radius": r, "colour": [r, g, b], "roughness": .8}}
+    {"instances": [{"label": 42, "world_from_object": 4x4, "registered": true}, {"label": 85,
+    "registered": false, "reason": "..."}],
+     "ground": {"point": [x, y, z], "normal": [x, y, z], "radius": r, "colour": [r, g, b],
+     "roughness": .8}}
 
-A registered instance has a reason where its pose is uncertain. The object frame is the asset frame (the GLB's coordinates after its node
-transforms), the world that of `cameras.json`.
+A registered instance has a reason where its pose is uncertain. The object frame is the asset frame
+(the GLB's coordinates after its node transforms), the world that of `cameras.json`.
 """
 
 from __future__ import annotations
@@ -45,12 +48,16 @@ def write_instances(folder: Path, asset: Asset) -> None:
     poses = [(f"instance_{i.label}", i.world_from_object) for i in asset.instances if i.registered]
     asset_from_world = np.linalg.inv(asset.world_from_asset)  # +Y stays up
     write_glb(
-        folder / "scene.glb", asset.mesh, asset.material, instances=[(name, asset_from_world @ np.asarray(pose)) for name, pose in poses]
+        folder / "scene.glb",
+        asset.mesh,
+        asset.material,
+        instances=[(name, asset_from_world @ np.asarray(pose)) for name, pose in poses],
     )
 
 
 def read_instances(folder: Path) -> tuple[tuple[Instance, ...], Ground | None]:
-    """What instances.json holds; nothing where there is none. Raises UserError for a damaged file."""
+    """What instances.json holds; nothing where there is none. Raises UserError for a damaged
+    file."""
     file = folder / "instances.json"
     if not file.is_file():
         return (), None
@@ -63,14 +70,30 @@ def read_instances(folder: Path) -> tuple[tuple[Instance, ...], Ground | None]:
             pose = None
             if entry.get("registered", True):
                 pose = np.array(entry["world_from_object"], np.float64)
-                if pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-30:
+                if (
+                    pose.shape != (4, 4)
+                    or not np.isfinite(pose).all()
+                    or abs(np.linalg.det(pose)) < 1e-30
+                ):
                     raise ValueError("a pose is no regular 4 x 4 matrix")
             instances.append(Instance(int(entry["label"]), pose, str(entry.get("reason", ""))))
         ground = None
         if data.get("ground"):
             g = data["ground"]
-            point, normal, colour = (np.array(g[k], np.float64).reshape(3) for k in ("point", "normal", "colour"))
-            ground = Ground(point, normal / np.linalg.norm(normal), float(g["radius"]), colour, float(g.get("roughness", 0.8)))
+            point, normal, colour = (
+                np.array(g[k], np.float64).reshape(3) for k in ("point", "normal", "colour")
+            )
+            ground = Ground(
+                point,
+                normal / np.linalg.norm(normal),
+                float(g["radius"]),
+                colour,
+                float(g.get("roughness", 0.8)),
+            )
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as e:
-        raise UserError("instances.json cannot be used", f"{type(e).__name__}: {e}", f"reconstruct again: {folder}") from None
+        raise UserError(
+            "instances.json cannot be used",
+            f"{type(e).__name__}: {e}",
+            f"reconstruct again: {folder}",
+        ) from None
     return tuple(instances), ground

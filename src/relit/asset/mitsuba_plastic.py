@@ -1,8 +1,9 @@
 """A rough plastic of varying width as a Mitsuba scene describes it.
 
-Mitsuba's `roughplastic` has one alpha for the whole object. So a few of them, of evenly spaced alphas, are blended by `blendbsdf`: with t
-the place of alpha between the least (0) and the greatest (LEVELS - 1), level k and all further ones are mixed by clip(t - k, 0, 1), which
-is linear interpolation between the two nearest levels.
+Mitsuba's `roughplastic` has one alpha for the whole object. So a few of them, of evenly spaced
+alphas, are blended by `blendbsdf`: with t the place of alpha between the least (0) and the greatest
+(LEVELS - 1), level k and all further ones are mixed by clip(t - k, 0, 1), which is linear
+interpolation between the two nearest levels.
 """
 
 from __future__ import annotations
@@ -21,9 +22,14 @@ EVEN = 0.02  # a relative range of alpha below which one plastic is enough
 
 
 def plastic_bsdf(folder: Path, material: Material) -> list[str]:
-    """Lines of the BSDF; writes textures/specular.exr and the blend's weights. The diffuse albedo is there already."""
+    """Lines of the BSDF; writes textures/specular.exr and the blend's weights. The diffuse albedo
+    is there already."""
     diffuse = "base_color.png" if material.diffuse is None else DIFFUSE
-    specular = np.ones((1, 1), np.float32) if material.specular is None else np.asarray(material.specular, np.float32)
+    specular = (
+        np.ones((1, 1), np.float32)
+        if material.specular is None
+        else np.asarray(material.specular, np.float32)
+    )
     specular = specular[..., None].repeat(3, -1) if specular.ndim == 2 else specular
     write_linear(folder / "textures" / "specular.exr", specular)
     alpha = np.square(np.asarray(material.roughness, np.float32))
@@ -36,7 +42,12 @@ def plastic_bsdf(folder: Path, material: Material) -> list[str]:
         write_data(folder / "textures" / f"wider_{k}.png", np.clip(place - k, 0, 1))
         file = f'<string name="filename" value="textures/wider_{k}.png"/>'
         weight = f'<texture type="bitmap" name="weight">{file}<boolean name="raw" value="true"/></texture>'
-        lines = ['<bsdf type="blendbsdf">', weight, *_plastic(levels[k], material.ior, diffuse), *lines]
+        lines = [
+            '<bsdf type="blendbsdf">',
+            weight,
+            *_plastic(levels[k], material.ior, diffuse),
+            *lines,
+        ]
         lines.append("</bsdf>")
     return lines
 

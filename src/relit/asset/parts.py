@@ -14,14 +14,16 @@ from relit.geometry.tangents import vertex_normals
 from relit.scene import Material, Mesh
 
 GUTTER = 8  # pixels of wrapped texture round each cell of an atlas
-MAX_REPEATS = 8  # how often a texture may be tiled over its part when several materials go into one atlas
+MAX_REPEATS = (
+    8  # how often a texture may be tiled over its part when several materials go into one atlas
+)
 MAX_ATLAS = 8192  # pixels
 
 
 @dataclass(frozen=True)
 class Part:
-    """vertices (V, 3), faces (F, 3), normals (V, 3) or None (flat shading), uvs (V, 2) or None with v = 0 at the top row;
-    key names the material."""
+    """vertices (V, 3), faces (F, 3), normals (V, 3) or None (flat shading), uvs (V, 2) or None with
+    v = 0 at the top row; key names the material."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -38,11 +40,14 @@ def flat(part: Part) -> Part:
     n = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-20)
     uvs = None if part.uvs is None else part.uvs[part.faces].reshape(-1, 2)
     faces = np.arange(3 * len(part.faces), dtype=np.int32).reshape(-1, 3)
-    return replace(part, vertices=corners.reshape(-1, 3), faces=faces, normals=np.repeat(n, 3, 0), uvs=uvs)
+    return replace(
+        part, vertices=corners.reshape(-1, 3), faces=faces, normals=np.repeat(n, 3, 0), uvs=uvs
+    )
 
 
 def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
-    """One mesh and one material; several materials are packed into an atlas. Raises UserError when nothing is there."""
+    """One mesh and one material; several materials are packed into an atlas. Raises UserError when
+    nothing is there."""
     if not parts:
         raise UserError("the model has no triangles", fix=f"check the file: {path}")
     parts = [p if p.normals is not None else flat(p) for p in parts]
@@ -58,7 +63,13 @@ def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
     textured = any(p.uvs is not None for p in parts)
     if not textured and material.normal is not None:
         material = replace(material, normal=None)
-    uvs = np.concatenate([p.uvs if p.uvs is not None else np.zeros((len(p.vertices), 2)) for p in parts]) if textured else None
+    uvs = (
+        np.concatenate(
+            [p.uvs if p.uvs is not None else np.zeros((len(p.vertices), 2)) for p in parts]
+        )
+        if textured
+        else None
+    )
     mesh = Mesh(
         np.concatenate([p.vertices for p in parts]).astype(np.float32),
         np.concatenate(faces).astype(np.int32),
@@ -66,10 +77,20 @@ def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
         None if uvs is None else uvs.astype(np.float32),
     )
     if not (np.isfinite(mesh.vertices).all() and (uvs is None or np.isfinite(uvs).all())):
-        raise UserError("the model has coordinates that are not numbers", fix=f"export it again: {path}")
-    maps = (material.base_color, material.roughness, material.metallic, material.specular, material.normal)
+        raise UserError(
+            "the model has coordinates that are not numbers", fix=f"export it again: {path}"
+        )
+    maps = (
+        material.base_color,
+        material.roughness,
+        material.metallic,
+        material.specular,
+        material.normal,
+    )
     if not all(a is None or np.isfinite(a).all() for a in maps):
-        raise UserError("the model has a material value that is not a number", fix=f"export it again: {path}")
+        raise UserError(
+            "the model has a material value that is not a number", fix=f"export it again: {path}"
+        )
     lost = ~(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 0.01)
     if lost.any():  # zero normals in the file
         mesh = replace(mesh, normals=np.where(lost[:, None], vertex_normals(mesh), mesh.normals))
@@ -77,7 +98,8 @@ def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
 
 
 def _atlas(parts: list[Part], keys: list, path: Path) -> tuple[list[Part], Material]:
-    """Grid atlas: each material gets a cell that holds as many repeats of its textures as its coordinates use."""
+    """Grid atlas: each material gets a cell that holds as many repeats of its textures as its
+    coordinates use."""
     materials, spans = {}, {}
     for key in keys:
         own = [p for p in parts if p.key == key]
@@ -104,24 +126,47 @@ def _atlas(parts: list[Part], keys: list, path: Path) -> tuple[list[Part], Mater
         out = np.zeros((rows * cell, columns * cell, channels), np.float32)
         for i, k in enumerate(keys):
             a = get(materials[k])
-            a = np.asarray([0, 0, 1] if channels == 3 and get is _normal else [1] * channels, np.float32)[None, None] if a is None else a
+            a = (
+                np.asarray(
+                    [0, 0, 1] if channels == 3 and get is _normal else [1] * channels, np.float32
+                )[None, None]
+                if a is None
+                else a
+            )
             a = a[..., None] if a.ndim == 2 else a
             a = np.broadcast_to(a, (*a.shape[:2], channels)) if a.shape[2] == 1 else a
-            a = np.tile(a, (int(spans[k][1][1]), int(spans[k][1][0]), 1)) if a.shape[:2] != (1, 1) else a
+            a = (
+                np.tile(a, (int(spans[k][1][1]), int(spans[k][1][0]), 1))
+                if a.shape[:2] != (1, 1)
+                else a
+            )
             shrinking = a.shape[0] > side
-            a = cv2.resize(np.ascontiguousarray(a), (side, side), interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
-            a = np.pad(a.reshape(side, side, channels), ((GUTTER, GUTTER), (GUTTER, GUTTER), (0, 0)), mode="wrap")
+            a = cv2.resize(
+                np.ascontiguousarray(a),
+                (side, side),
+                interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR,
+            )
+            a = np.pad(
+                a.reshape(side, side, channels),
+                ((GUTTER, GUTTER), (GUTTER, GUTTER), (0, 0)),
+                mode="wrap",
+            )
             y, x = divmod(i, columns)
             out[y * cell : (y + 1) * cell, x * cell : (x + 1) * cell] = a
         return out[..., 0] if channels == 1 else out
 
     iors = {m.ior for m in materials.values()}
     if len(iors) > 1:
-        raise UserError(f"the model's materials have different indices of refraction: {sorted(iors)}", fix=f"give them one: {path}")
+        raise UserError(
+            f"the model's materials have different indices of refraction: {sorted(iors)}",
+            fix=f"give them one: {path}",
+        )
     normal = pack(_normal, 3)
     if normal is not None:
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        normal = np.where(np.abs(normal).sum(-1, keepdims=True) > 0.1, normal, np.array([0, 0, 1], np.float32))
+        normal = np.where(
+            np.abs(normal).sum(-1, keepdims=True) > 0.1, normal, np.array([0, 0, 1], np.float32)
+        )
     merged = Material(
         pack(lambda m: m.base_color, 3),
         pack(lambda m: m.roughness, 1),
@@ -135,7 +180,9 @@ def _atlas(parts: list[Part], keys: list, path: Path) -> tuple[list[Part], Mater
         y, x = divmod(keys.index(p.key), columns)
         low, repeats = spans[p.key]
         uv = p.uvs if p.uvs is not None else np.full((len(p.vertices), 2), 0.5)
-        out.append(replace(p, uvs=((uv - low) / repeats * side + GUTTER + np.array([x, y]) * cell) / size))
+        out.append(
+            replace(p, uvs=((uv - low) / repeats * side + GUTTER + np.array([x, y]) * cell) / size)
+        )
     return out, merged
 
 
@@ -144,5 +191,9 @@ def _normal(m: Material):
 
 
 def _size(m: Material) -> tuple[int, int]:
-    shapes = [a.shape[:2] for a in (m.base_color, m.roughness, m.metallic, m.specular, m.normal) if a is not None]
+    shapes = [
+        a.shape[:2]
+        for a in (m.base_color, m.roughness, m.metallic, m.specular, m.normal)
+        if a is not None
+    ]
     return max(s[0] for s in shapes), max(s[1] for s in shapes)

@@ -19,7 +19,8 @@ validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])), {maxIs
 
 
 def find_validator() -> tuple[str, Path] | str:
-    """(node, node_modules folder), or one sentence that says what is missing. `RELIT_NODE_MODULES` names another folder."""
+    """(node, node_modules folder), or one sentence that says what is missing. `RELIT_NODE_MODULES`
+    names another folder."""
     node = shutil.which("node")
     if node is None:
         return "node is not installed"
@@ -32,15 +33,29 @@ def find_validator() -> tuple[str, Path] | str:
 
 
 def validate_glb(path: str | Path) -> dict:
-    """The validator's verdict on a .glb: {'numErrors', 'numWarnings', 'numInfos', 'messages': [...]}.
+    """The validator's verdict on a .glb: {'numErrors', 'numWarnings', 'numInfos', 'messages':
+    [...]}.
 
-    Raises UserError (exit code 5) when node or the package is missing, and when the validator itself fails.
+    Raises UserError (exit code 5) when node or the package is missing, and when the validator
+    itself fails.
     """
     found = find_validator()
     if isinstance(found, str):
-        raise UserError("the glTF validator cannot run", found, "install node 18 or newer, then: make validator", code=EXIT_ENVIRONMENT)
+        raise UserError(
+            "the glTF validator cannot run",
+            found,
+            "install node 18 or newer, then: make validator",
+            code=EXIT_ENVIRONMENT,
+        )
     node, folder = found
-    done = subprocess.run([node, "-e", SCRIPT, str(folder), str(path)], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [node, "-e", SCRIPT, str(folder), str(path)], capture_output=True, text=True, timeout=120
+    )
     if done.returncode:
-        raise UserError("the glTF validator failed", done.stderr.strip()[-500:], f"check the file: {path}", code=EXIT_ENVIRONMENT)
+        raise UserError(
+            "the glTF validator failed",
+            done.stderr.strip()[-500:],
+            f"check the file: {path}",
+            code=EXIT_ENVIRONMENT,
+        )
     return json.loads(done.stdout)

@@ -31,24 +31,37 @@ def bar_text(bar: Bar | None) -> str:
 
 
 def markdown(result: dict[str, Any], suite: Suite) -> str:
-    """A fragment for benchmarks/RESULTS.md: per variant one table with the objects, the mean, and the bar; then what failed, and why."""
-    lines = [f"Suite `{result['suite']}`, quality `{result['quality']}`, device `{result['device']}`, {result['machine']}.", ""]
+    """A fragment for benchmarks/RESULTS.md: per variant one table with the objects, the mean, and
+    the bar; then what failed, and why."""
+    lines = [
+        f"Suite `{result['suite']}`, quality `{result['quality']}`, device `{result['device']}`, {result['machine']}.",
+        "",
+    ]
     for variant, runs in result["runs"].items():
         lines += [f"### {variant}", ""]
         if runs:
-            lines += [f"| figure | unit | {' | '.join(runs)} | mean | bar | |", "|---" * (len(runs) + 5) + "|"]
+            lines += [
+                f"| figure | unit | {' | '.join(runs)} | mean | bar | |",
+                "|---" * (len(runs) + 5) + "|",
+            ]
         for figure in means(runs):
             values = " | ".join(f"{r['metrics'][figure]['value']:.4g}" for r in runs.values())
-            bar, unit = suite.bar(figure, result["quality"]), next(iter(runs.values()))["metrics"][figure]["unit"]
+            bar, unit = (
+                suite.bar(figure, result["quality"]),
+                next(iter(runs.values()))["metrics"][figure]["unit"],
+            )
             mean = result["means"][variant].get(figure)
             told = ("", "") if mean is None else (f"{mean:.4g}", verdict(bar, mean))
-            lines.append(f"| {figure} | {unit} | {values} | {told[0]} | {bar_text(bar)} | {told[1]} |")
+            lines.append(
+                f"| {figure} | {unit} | {values} | {told[0]} | {bar_text(bar)} | {told[1]} |"
+            )
         lines += [*([""] if runs else []), *_failures(result["failed"][variant])]
     return "\n".join(lines)
 
 
 def table(result: dict[str, Any], suite: Suite):
-    """A rich Table of the means: one column a variant, one row a figure. A variant of which an object failed is a column of dashes."""
+    """A rich Table of the means: one column a variant, one row a figure. A variant of which an
+    object failed is a column of dashes."""
     from rich.table import Table
 
     objects = {*result["runs"]["plain"], *result["failed"]["plain"]}
@@ -60,7 +73,10 @@ def table(result: dict[str, Any], suite: Suite):
     out.add_column("")
     for figure in dict.fromkeys(f for m in result["means"].values() for f in m):
         bar, value = suite.bar(figure, result["quality"]), result["means"]["plain"].get(figure)
-        row = [f"{m[figure]:.4g}" if figure in m else "" if m else "-" for m in result["means"].values()]
+        row = [
+            f"{m[figure]:.4g}" if figure in m else "" if m else "-"
+            for m in result["means"].values()
+        ]
         out.add_row(figure, *row, bar_text(bar), "" if value is None else verdict(bar, value))
     return out
 

@@ -1,6 +1,8 @@
-"""The suites: what is rendered, how it is reconstructed and scored, the bars of its means, its named ablations.
+"""The suites: what is rendered, how it is reconstructed and scored, the bars of its means, its
+named ablations.
 
-A suite of another capture kind is one entry of SUITES, most readably from a module of its own that only holds it.
+A suite of another capture kind is one entry of SUITES, most readably from a module of its own that
+only holds it.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ Bar = tuple[str, float]  # ('>=' or '<=', value)
 
 @dataclass(frozen=True)
 class Item:
-    """One object of a suite. asset: file relative to the data folder. light: one such file, or several (photos under many lights, ...).
+    """One object of a suite. asset: file relative to the data folder. light: one such file, or
+    several (photos under many lights, ...).
     options: what goes to the synthesizer for this object alone, before the suite's own options."""
 
     name: str
@@ -26,24 +29,28 @@ class Item:
 
 @dataclass(frozen=True)
 class Suite:
-    """kind: as `relit reconstruct --capture` knows it. relights: lights, relative to the data folder, for the truth of relighting.
+    """kind: as `relit reconstruct --capture` knows it. relights: lights, relative to the data
+    folder, for the truth of relighting.
 
     options: keyword arguments of the synthesizer, for all objects.
-    synthesize: 'module.function', called as f(asset, light, out, relights=[...], **options, say=...) -> capture folder; several lights
-    come as a list. Beside it in its module stands settings_of(asset, light, relights=[...], **options): everything that the capture
-    depends on, whose hash names the folder in the cache.
-    evaluate: 'module.function', called as f(run, capture, spp=...) -> {"metrics": {name: {"value", "unit", "definition"}}, ...}.
+    synthesize: 'module.function', called as f(asset, light, out, relights=[...], **options,
+    say=...) -> capture folder; several lights come as a list. Beside it in its module stands
+    settings_of(asset, light, relights=[...], **options): everything that the capture depends on,
+    whose hash names the folder in the cache.
+    evaluate: 'module.function', called as f(run, capture, spp=...) -> {"metrics": {name: {"value",
+    "unit", "definition"}}, ...}.
     bars: of the means at quality standard, figure -> bar; draft_bars: at draft.
     flags: words added to every `relit reconstruct` of the suite.
-    ablations: name -> words for `relit reconstruct`: each is 'key=value' (a --set) or a flag such as '--masks=none'.
+    ablations: name -> words for `relit reconstruct`: each is 'key=value' (a --set) or a flag such
+    as '--masks=none'.
     """
 
     kind: str
     items: tuple[Item, ...]
     relights: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
-    synthesize: str = "relit.capture.synthetic.synthesize_multiview"
-    evaluate: str = "relit.evaluate.protocols.evaluate"
+    synthesize: str = "relit.synthesize.multiview.synthesize_multiview"
+    evaluate: str = "relit.evaluate.dispatch.evaluate"
     bars: Mapping[str, Bar] = field(default_factory=dict)
     draft_bars: Mapping[str, Bar] = field(default_factory=dict)
     flags: tuple[str, ...] = ()
@@ -63,12 +70,26 @@ def named(path: str) -> Callable:
 MULTIVIEW = Suite(
     kind="multiview",
     items=(
-        Item("spot", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"roughness": 0.4, "metallic": 0.0}),
+        Item(
+            "spot",
+            "assets/spot/spot.obj",
+            "envmaps/lebombo_1k.hdr",
+            {"roughness": 0.4, "metallic": 0.0},
+        ),
         Item("boombox", "assets/BoomBox.glb", "envmaps/kiara_1_dawn_1k.hdr"),
-        Item("stool", "assets/painted_wooden_stool_1k.glb", "envmaps/immenstadter_horn_1k.hdr"),  # a sun of 7040
+        Item(
+            "stool", "assets/painted_wooden_stool_1k.glb", "envmaps/immenstadter_horn_1k.hdr"
+        ),  # a sun of 7040
     ),
     relights=("envmaps/adams_place_bridge_1k.hdr", "envmaps/forest_slope_1k.hdr"),
-    options={"views": 60, "test_views": 12, "resolution": 400, "spp": 64, "test_spp": 256, "seed": 0},
+    options={
+        "views": 60,
+        "test_views": 12,
+        "resolution": 400,
+        "spp": 64,
+        "test_spp": 256,
+        "seed": 0,
+    },
     bars={
         "seconds": ("<=", 360.0),
         "peak_memory": ("<=", 4.0),
@@ -101,10 +122,19 @@ FLASH = Suite(
     items=(
         Item("spot", "assets/spot/spot.obj", ()),
         Item("teapot", TEA, (), {"nodes": ["tea_set_01_teapot_01", "tea_set_01_teapot_01_lid"]}),
-        Item("cup", TEA, (), {"nodes": ["tea_set_01_cup_small_01"]}),  # concave: its inside lights itself
+        Item(
+            "cup", TEA, (), {"nodes": ["tea_set_01_cup_small_01"]}
+        ),  # concave: its inside lights itself
     ),
-    options={"views": 120, "test_views": 20, "resolution": 400, "spp": 64, "test_spp": 64, "seed": 0},
-    synthesize="relit.capture.synthetic_flash.synthesize_flash",
+    options={
+        "views": 120,
+        "test_views": 20,
+        "resolution": 400,
+        "spp": 64,
+        "test_spp": 64,
+        "seed": 0,
+    },
+    synthesize="relit.synthesize.flash.synthesize_flash",
     evaluate="relit.evaluate.flash.evaluate_flash",
     bars={
         "seconds": ("<=", 720.0),
@@ -115,13 +145,23 @@ FLASH = Suite(
         "roughness_mse": ("<=", 0.85e-3),
         "flash_angle": ("<=", 0.2),
     },
-    ablations={name: (f"without={name}",) for name in ("offset", "shadow", "interreflection", "features", "refinement")}
+    ablations={
+        name: (f"without={name}",)
+        for name in ("offset", "shadow", "interreflection", "features", "refinement")
+    }
     | {"offset+shadow": ("without=offset,shadow",), "hollows": ("hollows=0",)},
 )
 
 LIGHTS = tuple(
     f"envmaps/{name}_1k.hdr"
-    for name in ("adams_place_bridge", "empty_warehouse_01", "forest_slope", "immenstadter_horn", "kiara_1_dawn", "lebombo")
+    for name in (
+        "adams_place_bridge",
+        "empty_warehouse_01",
+        "forest_slope",
+        "immenstadter_horn",
+        "kiara_1_dawn",
+        "lebombo",
+    )
 )
 COLLECTION = Suite(
     kind="collection",
@@ -130,8 +170,15 @@ COLLECTION = Suite(
         Item("boombox", "assets/BoomBox.glb", LIGHTS),
         Item("stool", "assets/painted_wooden_stool_1k.glb", LIGHTS),
     ),
-    options={"views": 60, "test_views": 6, "resolution": 400, "spp": 48, "test_spp": 192, "seed": 0},
-    synthesize="relit.capture.synthetic_collection.synthesize_collection",
+    options={
+        "views": 60,
+        "test_views": 6,
+        "resolution": 400,
+        "spp": 48,
+        "test_spp": 192,
+        "seed": 0,
+    },
+    synthesize="relit.synthesize.collection.synthesize_collection",
     evaluate="relit.evaluate.collection.evaluate_collection",
     bars={
         "seconds": ("<=", 1500.0),
@@ -141,24 +188,73 @@ COLLECTION = Suite(
         "novel_psnr": (">=", 25.0),
         "albedo_psnr": (">=", 22.0),
     },
-    ablations={name: (f"without={name}",) for name in ("multiplex", "search", "posterior", "coarse_to_fine", "quadrants", "light_prior")},
+    ablations={
+        name: (f"without={name}",)
+        for name in (
+            "multiplex",
+            "search",
+            "posterior",
+            "coarse_to_fine",
+            "quadrants",
+            "light_prior",
+        )
+    },
 )
 
 SPOT_MATERIAL = {"roughness": 0.4, "metallic": 0.0}
 DUPLICATES = Suite(
     kind="duplicates",
     items=(
-        Item("spot-10", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 10, **SPOT_MATERIAL}),
-        Item("bottle-10", "assets/WaterBottle.glb", "envmaps/kiara_1_dawn_1k.hdr", {"count": 10}),  # part metal
-        Item("cup-10", TEA, "envmaps/immenstadter_horn_1k.hdr", {"count": 10, "nodes": ["tea_set_01_cup_small_01"]}),
-        Item("spot-6", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 6, **SPOT_MATERIAL}),
-        Item("spot-20", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 20, **SPOT_MATERIAL}),
-        Item("spot-30", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 30, **SPOT_MATERIAL}),
-        Item("spot-60", "assets/spot/spot.obj", "envmaps/lebombo_1k.hdr", {"count": 60, **SPOT_MATERIAL}),
+        Item(
+            "spot-10",
+            "assets/spot/spot.obj",
+            "envmaps/lebombo_1k.hdr",
+            {"count": 10, **SPOT_MATERIAL},
+        ),
+        Item(
+            "bottle-10", "assets/WaterBottle.glb", "envmaps/kiara_1_dawn_1k.hdr", {"count": 10}
+        ),  # part metal
+        Item(
+            "cup-10",
+            TEA,
+            "envmaps/immenstadter_horn_1k.hdr",
+            {"count": 10, "nodes": ["tea_set_01_cup_small_01"]},
+        ),
+        Item(
+            "spot-6",
+            "assets/spot/spot.obj",
+            "envmaps/lebombo_1k.hdr",
+            {"count": 6, **SPOT_MATERIAL},
+        ),
+        Item(
+            "spot-20",
+            "assets/spot/spot.obj",
+            "envmaps/lebombo_1k.hdr",
+            {"count": 20, **SPOT_MATERIAL},
+        ),
+        Item(
+            "spot-30",
+            "assets/spot/spot.obj",
+            "envmaps/lebombo_1k.hdr",
+            {"count": 30, **SPOT_MATERIAL},
+        ),
+        Item(
+            "spot-60",
+            "assets/spot/spot.obj",
+            "envmaps/lebombo_1k.hdr",
+            {"count": 60, **SPOT_MATERIAL},
+        ),
     ),
     relights=("envmaps/adams_place_bridge_1k.hdr", "envmaps/forest_slope_1k.hdr"),
-    options={"test_views": 8, "resolution": 1600, "test_resolution": 400, "spp": 64, "test_spp": 128, "seed": 0},
-    synthesize="relit.capture.synthetic_duplicates.synthesize_duplicates",
+    options={
+        "test_views": 8,
+        "resolution": 1600,
+        "test_resolution": 400,
+        "spp": 64,
+        "test_spp": 128,
+        "seed": 0,
+    },
+    synthesize="relit.synthesize.duplicates.synthesize_duplicates",
     evaluate="relit.evaluate.duplicates.evaluate_duplicates",
     bars={
         "seconds": ("<=", 600.0),
@@ -175,9 +271,24 @@ DUPLICATES = Suite(
         name: (f"without={name}",)
         for name in (
             *("rotation_sweep", "matching", "guided", "search", "refinement"),
-            *("textures", "symmetry", "visibility", "hidden", "unseen", "metal", "first_material", "ground", "normals"),
+            *(
+                "textures",
+                "symmetry",
+                "visibility",
+                "hidden",
+                "unseen",
+                "metal",
+                "first_material",
+                "ground",
+                "normals",
+            ),
         )
     },
 )
 
-SUITES: dict[str, Suite] = {"multiview": MULTIVIEW, "flash": FLASH, "collection": COLLECTION, "duplicates": DUPLICATES}
+SUITES: dict[str, Suite] = {
+    "multiview": MULTIVIEW,
+    "flash": FLASH,
+    "collection": COLLECTION,
+    "duplicates": DUPLICATES,
+}

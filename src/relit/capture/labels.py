@@ -1,4 +1,5 @@
-"""Which pixel of a photo belongs to which object: label images, cut-outs, COCO annotations, BOP's masks."""
+"""Which pixel of a photo belongs to which object: label images, cut-outs, COCO annotations, BOP's
+masks."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ BOP_TRUTH = "scene_gt.json"
 
 
 def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W) int32 numbers of the objects, 0 for the rest. Raises UserError when the labels do not fit the photo."""
+    """(H, W) int32 numbers of the objects, 0 for the rest. Raises UserError when the labels do not
+    fit the photo."""
     if source.name == BOP_TRUTH:
         return _from_bop(source, photo, shape)
     if source.is_dir():
@@ -27,10 +29,17 @@ def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray
         return _from_coco(source, photo, shape)
     data = decode_file(source, cv2.IMREAD_UNCHANGED)
     if data is None:
-        raise UserError("the label image cannot be read", "it is damaged or no picture", f"write it again: {source}")
+        raise UserError(
+            "the label image cannot be read",
+            "it is damaged or no picture",
+            f"write it again: {source}",
+        )
     labels = _numbers(data)
     if labels.shape != shape:
-        if abs(labels.shape[1] / labels.shape[0] - shape[1] / shape[0]) > 0.01 * shape[1] / shape[0]:
+        if (
+            abs(labels.shape[1] / labels.shape[0] - shape[1] / shape[0])
+            > 0.01 * shape[1] / shape[0]
+        ):
             raise UserError(
                 f"the labels have another shape than the photo: {labels.shape[1]} x {labels.shape[0]} and {shape[1]} x {shape[0]} pixels",
                 "they belong to another photo, or one of them was cropped or turned",
@@ -75,7 +84,8 @@ def bop_object(truth: dict) -> int:
 
 
 def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Instances of the scene's commonest object, from mask_visib/ (what can be seen of each) or mask/."""
+    """Instances of the scene's commonest object, from mask_visib/ (what can be seen of each) or
+    mask/."""
     try:
         truth = read_json(source)
         chosen, entries = bop_object(truth), truth[str(int(photo.stem))]
@@ -84,13 +94,28 @@ def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
             if int(entry["obj_id"]) != chosen:
                 continue
             name = f"{photo.stem}_{k:06d}.png"
-            file = next((f for f in (source.parent / "mask_visib" / name, source.parent / "mask" / name) if f.is_file()), None)
+            file = next(
+                (
+                    f
+                    for f in (source.parent / "mask_visib" / name, source.parent / "mask" / name)
+                    if f.is_file()
+                ),
+                None,
+            )
             mask = None if file is None else decode_file(file, cv2.IMREAD_GRAYSCALE)
             if mask is None or mask.shape != shape:
-                raise UserError(f"no usable mask {name}", "each instance needs its mask at the photo's size", f"see: {source.parent}")
+                raise UserError(
+                    f"no usable mask {name}",
+                    "each instance needs its mask at the photo's size",
+                    f"see: {source.parent}",
+                )
             labels[mask > 127] = k + 1
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise UserError("scene_gt.json is not as BOP writes it", f"{type(error).__name__}: {error}", f"see: {source}") from None
+        raise UserError(
+            "scene_gt.json is not as BOP writes it",
+            f"{type(error).__name__}: {error}",
+            f"see: {source}",
+        ) from None
     return labels
 
 
@@ -105,7 +130,11 @@ def which_objects(source: Path, photo: Path) -> str | None:
         return None
     listed = data.get("categories")
     listed = listed if isinstance(listed, list) else []
-    names = {c["id"]: c.get("name") for c in listed if isinstance(c, dict) and isinstance(c.get("id"), int)}
+    names = {
+        c["id"]: c.get("name")
+        for c in listed
+        if isinstance(c, dict) and isinstance(c.get("id"), int)
+    }
     return f"the objects are those of category {names.get(chosen, chosen)}, the commonest; others are left out"
 
 
@@ -114,14 +143,19 @@ def _commonest(kinds: list):
 
 
 def _coco_category(data: dict, photo: Path) -> int | None:
-    """Of several categories the one with the most objects in the photos that lie in the photo's folder; None where all objects count: there
-    is but one, or each object has one of its own. What says that it is a group (iscrowd) is an object too: many tools write it of whatever
-    has run lengths."""
+    """Of several categories the one with the most objects in the photos that lie in the photo's
+    folder; None where all objects count: there is but one, or each object has one of its own. What
+    says that it is a group (iscrowd) is an object too: many tools write it of whatever has run
+    lengths."""
     images = [i for i in data["images"] if isinstance(i, dict)]
     names = {f.name for f in photo.parent.iterdir()}
     here = [i for i in images if Path(str(i.get("file_name", ""))).name in names] or images
     ids = {str(i.get("id")) for i in here}
-    kinds = [_coco_kind(a) for a in data["annotations"] if isinstance(a, dict) and str(a.get("image_id")) in ids]
+    kinds = [
+        _coco_kind(a)
+        for a in data["annotations"]
+        if isinstance(a, dict) and str(a.get("image_id")) in ids
+    ]
     if len(set(kinds)) < 2 or len(set(kinds)) == len(kinds):
         return None
     return _commonest(kinds)
@@ -141,15 +175,24 @@ def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
     if entry is None and len(images) == 1:
         entry = images[0]
     if entry is None:
-        raise UserError(f"the annotations do not name the photo {photo.name}", fix=f"check `images`: {file}")
+        raise UserError(
+            f"the annotations do not name the photo {photo.name}", fix=f"check `images`: {file}"
+        )
     size = [entry.get("height", shape[0]), entry.get("width", shape[1])]
     if not all(isinstance(v, (int, float)) and 1 <= v < 1e6 for v in size):
-        raise UserError(f"the annotations give the photo {photo.name} the size {size}", fix=f"check `images`: {file}")
+        raise UserError(
+            f"the annotations give the photo {photo.name} the size {size}",
+            fix=f"check `images`: {file}",
+        )
     sx, sy = shape[1] / size[1], shape[0] / size[0]
     labels, k = np.zeros(shape, np.int32), 0
     chosen = _coco_category(data, photo)
     for a in data["annotations"]:
-        if not isinstance(a, dict) or a.get("image_id") != entry.get("id") or chosen not in (None, _coco_kind(a)):
+        if (
+            not isinstance(a, dict)
+            or a.get("image_id") != entry.get("id")
+            or chosen not in (None, _coco_kind(a))
+        ):
             continue
         k += 1
         s = a.get("segmentation")
@@ -163,21 +206,31 @@ def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
                     raise ValueError("corners far outside the photo")
                 cv2.fillPoly(labels, [p.astype(np.int32) for p in polygons], k)
         except (TypeError, ValueError, KeyError, OverflowError, cv2.error) as error:
-            raise UserError(f"annotation {k} has no usable segmentation", str(error), f"polygons or run lengths: {file}") from None
+            raise UserError(
+                f"annotation {k} has no usable segmentation",
+                str(error),
+                f"polygons or run lengths: {file}",
+            ) from None
     return labels
 
 
 def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[str]]:
-    """Labels without objects that are too small, and notes about them. Raises UserError when fewer than one object is left."""
+    """Labels without objects that are too small, and notes about them. Raises UserError when fewer
+    than one object is left."""
     values, index, areas = np.unique(labels, return_inverse=True, return_counts=True)
     index, notes = index.reshape(labels.shape), []
     objects = values > 0
     if not objects.any():
-        raise UserError("the labels hold no object: they are black all over", fix=f"give each object a grey level or colour: {source}")
+        raise UserError(
+            "the labels hold no object: they are black all over",
+            fix=f"give each object a grey level or colour: {source}",
+        )
     large = objects & (areas >= LEAST_SIDE**2 / 4)
     if large.sum() > MOST or (objects.sum() > 3 * MOST and large.sum() == 0):
         raise UserError(
-            f"the label image holds {int(objects.sum())} values", "it is a photograph, not labels", f"one value per object: {source}"
+            f"the label image holds {int(objects.sum())} values",
+            "it is a photograph, not labels",
+            f"one value per object: {source}",
         )
     typical = np.median(areas[large]) if large.any() else 0
     keep = large & (areas >= 0.02 * typical)
@@ -188,10 +241,14 @@ def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[s
     gone = int((objects & ~keep).sum())
     if not keep.any():
         raise UserError(
-            f"every object is smaller than {LEAST_SIDE} pixels", "so few pixels carry no pose", f"take a larger photo: {source}"
+            f"every object is smaller than {LEAST_SIDE} pixels",
+            "so few pixels carry no pose",
+            f"take a larger photo: {source}",
         )
     if gone:
-        notes.append(f"{gone} labels cover less than {LEAST_SIDE} pixels, or next to nothing beside the others, and are left out")
+        notes.append(
+            f"{gone} labels cover less than {LEAST_SIDE} pixels, or next to nothing beside the others, and are left out"
+        )
     if keep.sum() == 1:
         notes.append("there is only one object: nothing but its front can be known from one photo")
     border = np.unique(np.concatenate([index[0], index[-1], index[:, 0], index[:, -1]]))

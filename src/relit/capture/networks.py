@@ -1,10 +1,14 @@
-"""Networks that a user brings as ONNX files: which pixel belongs to which object, and normal priors. They run in OpenCV.
+"""Networks that a user brings as ONNX files: which pixel belongs to which object, and normal
+priors. They run in OpenCV.
 
-A picture goes in as (1, 3, H, W), normalised as ImageNet's, its longer side SIDE and both sides multiples of 32.
+A picture goes in as (1, 3, H, W), normalised as ImageNet's, its longer side SIDE and both sides
+multiples of 32.
 
-instances   out: numbers of the objects, 0 elsewhere, as (1, H, W) or (1, 1, H, W) (a panoptic segmenter), or (1, N, h, w), a mask for each
+instances   out: numbers of the objects, 0 elsewhere, as (1, H, W) or (1, 1, H, W) (a panoptic
+            segmenter), or (1, N, h, w), a mask for each
             of N objects, as probabilities or as logits
-normals     out: (1, 3, h, w), x right, y up, z towards the camera, in [-1, 1] or coded in [0, 1]; called with each object alone on black
+normals     out: (1, 3, h, w), x right, y up, z towards the camera, in [-1, 1] or coded in [0, 1];
+            called with each object alone on black
             (as in SfD)
 """
 
@@ -35,17 +39,26 @@ class Network:
         try:
             self.net = cv2.dnn.readNetFromONNX(str(self.path))
         except cv2.error as error:
-            raise UserError("the network cannot be read", first_line(error), f"give an ONNX file: {self.path}") from None
+            raise UserError(
+                "the network cannot be read", first_line(error), f"give an ONNX file: {self.path}"
+            ) from None
 
     def __call__(self, rgb: np.ndarray, side: int) -> np.ndarray:
-        """(H, W, 3) linear in [0, 1], its longer side brought to about `side` -> what the network says."""
+        """(H, W, 3) linear in [0, 1], its longer side brought to about `side` -> what the network
+        says."""
         s = side / max(rgb.shape[:2])
         h, w = (max(MULTIPLE, round(n * s / MULTIPLE) * MULTIPLE) for n in rgb.shape[:2])
-        return self.run(cv2.resize(np.clip(srgb_from_linear(rgb), 0, 1).astype(np.float32), (w, h), interpolation=cv2.INTER_AREA))
+        return self.run(
+            cv2.resize(
+                np.clip(srgb_from_linear(rgb), 0, 1).astype(np.float32),
+                (w, h),
+                interpolation=cv2.INTER_AREA,
+            )
+        )
 
     def run(self, shown: np.ndarray) -> np.ndarray:
-        """(H, W, 3) float32 sRGB values in [0, 1], at the size that the network gets -> what it says. Raises UserError where it takes none
-        of that size."""
+        """(H, W, 3) float32 sRGB values in [0, 1], at the size that the network gets -> what it
+        says. Raises UserError where it takes none of that size."""
         h, w = shown.shape[:2]
         blob = ((shown - np.float32(MEAN)) / np.float32(SPREAD)).transpose(2, 0, 1)[None]
         try:
@@ -53,12 +66,18 @@ class Network:
             return np.asarray(self.net.forward())
         except cv2.error as error:
             raise UserError(
-                f"the network does not take a picture of {w} x {h}", first_line(error), f"export it with free sides: {self.path}"
+                f"the network does not take a picture of {w} x {h}",
+                first_line(error),
+                f"export it with free sides: {self.path}",
             ) from None
 
     def strange(self, out: np.ndarray, wanted: str) -> UserError:
         """What to raise for an output that is not what is `wanted`."""
-        return UserError(f"the network's output is {' x '.join(map(str, out.shape))}", f"{wanted} is looked for", f"see: {self.path}")
+        return UserError(
+            f"the network's output is {' x '.join(map(str, out.shape))}",
+            f"{wanted} is looked for",
+            f"see: {self.path}",
+        )
 
 
 def first_line(error: Exception) -> str:
@@ -67,16 +86,22 @@ def first_line(error: Exception) -> str:
 
 
 def found_instances(network: Network, rgb: np.ndarray) -> np.ndarray:
-    """(H, W) int32 numbers of the objects that the network finds, 0 elsewhere. Where masks overlap, the smaller object is in front."""
+    """(H, W) int32 numbers of the objects that the network finds, 0 elsewhere. Where masks overlap,
+    the smaller object is in front."""
     h, w = rgb.shape[:2]
     out = network(rgb, SIDE)
     if out.ndim == 4 and out.shape[:2] == (1, 1):
         out = out[0]
     if out.ndim == 3 and out.shape[0] == 1:
-        labels = cv2.resize(np.round(out[0]).astype(np.float32), (w, h), interpolation=cv2.INTER_NEAREST).astype(np.int32)
+        labels = cv2.resize(
+            np.round(out[0]).astype(np.float32), (w, h), interpolation=cv2.INTER_NEAREST
+        ).astype(np.int32)
     elif out.ndim == 4 and out.shape[0] == 1:
         level = 0.5 if out.min() >= 0 and out.max() <= 1 else 0.0
-        masks = [cv2.resize(m.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR) > level for m in out[0]]
+        masks = [
+            cv2.resize(m.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR) > level
+            for m in out[0]
+        ]
         labels = np.zeros((h, w), np.int32)
         for k in sorted(range(len(masks)), key=lambda k: -masks[k].sum()):
             labels[masks[k]] = k + 1
@@ -86,7 +111,9 @@ def found_instances(network: Network, rgb: np.ndarray) -> np.ndarray:
         if value < 0 or (labels == value).mean() < LEAST_AREA:
             labels[labels == value] = 0
     if not labels.any():
-        raise UserError("the segmenter finds no object in the photo", fix="give labels, or another network")
+        raise UserError(
+            "the segmenter finds no object in the photo", fix="give labels, or another network"
+        )
     return labels
 
 
@@ -97,13 +124,18 @@ def predicted_normals(network: Network, rgb: np.ndarray, labels: np.ndarray) -> 
         own = labels == value
         y, x = np.nonzero(own)
         grow = round(MARGIN * max(np.ptp(x), np.ptp(y)))
-        window = (slice(max(y.min() - grow, 0), y.max() + grow + 1), slice(max(x.min() - grow, 0), x.max() + grow + 1))
+        window = (
+            slice(max(y.min() - grow, 0), y.max() + grow + 1),
+            slice(max(x.min() - grow, 0), x.max() + grow + 1),
+        )
         mask = own[window][..., None]
         n = network(np.clip(rgb[window], 0, 1) * mask, CROP_SIDE)
         if n.ndim != 4 or n.shape[:2] != (1, 3):
             raise network.strange(n, "normals (1, 3, h, w)")
         n = n[0].transpose(1, 2, 0).astype(np.float32)
         n = n * 2 - 1 if n.min() >= 0 else n
-        n = cv2.resize(np.ascontiguousarray(n), mask.shape[1::-1], interpolation=cv2.INTER_LINEAR) * np.float32([1, -1, -1])
+        n = cv2.resize(
+            np.ascontiguousarray(n), mask.shape[1::-1], interpolation=cv2.INTER_LINEAR
+        ) * np.float32([1, -1, -1])
         out[window] += n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6) * mask
     return out

@@ -1,4 +1,5 @@
-"""From a file to a `Photo` that decodes when it is asked: upright, linear, masked, resized, undistorted."""
+"""From a file to a `Photo` that decodes when it is asked: upright, linear, masked, resized,
+undistorted."""
 
 from __future__ import annotations
 
@@ -11,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from relit.cameras.pinhole import Lens, lens_of, undistorted_camera, undistortion_map
 from relit.capture.frames import Frame, Reading, image_folder, list_images
 from relit.errors import UserError
+from relit.geometry.lens import Lens, lens_of, undistorted_camera, undistortion_map
 from relit.images import EXTENSIONS, RAW, Header, read_data, read_header, read_image, turn_upright
 from relit.masks.files import read_mask
 from relit.masks.rle import Runs
@@ -25,9 +26,11 @@ NORMAL_FOLDERS = ("normals", "normal")
 
 @dataclass(frozen=True)
 class Decoder:
-    """Reads one photo file. Called without arguments it returns the upright `Pixels` at `size` (width, height), lens distortion kept.
+    """Reads one photo file. Called without arguments it returns the upright `Pixels` at `size`
+    (width, height), lens distortion kept.
 
-    mask: a file, run lengths, a backdrop, True for the file's own alpha channel, or None. invert: the mask file is white off the object.
+    mask: a file, run lengths, a backdrop, True for the file's own alpha channel, or None. invert:
+    the mask file is white off the object.
     orientation: the photo's in EXIF, for masks that were made from the pixels as stored.
     """
 
@@ -49,7 +52,9 @@ class Decoder:
         elif isinstance(self.mask, Path):
             mask = file_mask(self.mask, shape, self.invert, self.orientation)
         elif isinstance(self.mask, Runs):
-            mask = fitted_mask(self.mask.decode(), shape, self.orientation, f"the runs of '{self.mask.name}'")
+            mask = fitted_mask(
+                self.mask.decode(), shape, self.orientation, f"the runs of '{self.mask.name}'"
+            )
         elif isinstance(self.mask, Backdrop):
             mask = self.mask(rgb)
             if self.mask.dark:
@@ -59,8 +64,17 @@ class Decoder:
         if (h, w) != shape:
             rgb = cv2.resize(rgb, (w, h), interpolation=cv2.INTER_AREA)
             mask = None if mask is None else cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA)
-            clipped = None if clipped is None else cv2.resize(clipped.astype(np.uint8), (w, h), interpolation=cv2.INTER_LINEAR) > 0
-            normal = None if normal is None else _unit_normals(cv2.resize(normal, (w, h), interpolation=cv2.INTER_AREA))
+            clipped = (
+                None
+                if clipped is None
+                else cv2.resize(clipped.astype(np.uint8), (w, h), interpolation=cv2.INTER_LINEAR)
+                > 0
+            )
+            normal = (
+                None
+                if normal is None
+                else _unit_normals(cv2.resize(normal, (w, h), interpolation=cv2.INTER_AREA))
+            )
         return Pixels(rgb, mask, normal, clipped)
 
 
@@ -100,12 +114,17 @@ class Masked:
 
     def __call__(self) -> Pixels:
         h, w = self.shape
-        mask = np.unpackbits(np.frombuffer(self.bits, np.uint8), count=h * w).reshape(h, w).astype(np.float32)
+        mask = (
+            np.unpackbits(np.frombuffer(self.bits, np.uint8), count=h * w)
+            .reshape(h, w)
+            .astype(np.float32)
+        )
         return replace(self.load(), mask=mask)
 
 
 def layers(load: Callable[[], Pixels]) -> Iterator[Callable[[], Pixels]]:
-    """What a photo is loaded by and all that this wraps: the last one, a `Decoder`, reads the file."""
+    """What a photo is loaded by and all that this wraps: the last one, a `Decoder`, reads the
+    file."""
     while load is not None:
         yield load
         load = getattr(load, "load", None)
@@ -121,7 +140,10 @@ class _Key:
 
     def __init__(self, camera: Camera, lens: Lens, ideal: Camera):
         self.parts = (camera, lens, ideal)
-        self.values = (lens, *((c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.distortion) for c in (camera, ideal)))
+        self.values = (
+            lens,
+            *((c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.distortion) for c in (camera, ideal)),
+        )
 
     def __hash__(self) -> int:
         return hash(self.values)
@@ -136,22 +158,40 @@ def _cached_map(key: _Key) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_camera(photo: Photo, camera: Camera, lens: Lens | None = None) -> Photo:
-    """Give a photo (as decoded, distortion in it) its camera, in pixels of any size of the same shape; undistort it if need be."""
-    camera = camera.resized(photo.width, photo.height) if (camera.width, camera.height) != (photo.width, photo.height) else camera
+    """Give a photo (as decoded, distortion in it) its camera, in pixels of any size of the same
+    shape; undistort it if need be."""
+    camera = (
+        camera.resized(photo.width, photo.height)
+        if (camera.width, camera.height) != (photo.width, photo.height)
+        else camera
+    )
     lens = lens or lens_of(camera)
     ideal = undistorted_camera(camera, lens)
     if lens is None:
         return replace(photo, camera=ideal)
-    return replace(photo, camera=ideal, width=ideal.width, height=ideal.height, load=Undistorted(photo.load, camera, lens, ideal))
+    return replace(
+        photo,
+        camera=ideal,
+        width=ideal.width,
+        height=ideal.height,
+        load=Undistorted(photo.load, camera, lens, ideal),
+    )
 
 
-def photo_from(frame: Frame, header: Header, max_side: int | None, normals: dict[str, Path] | None = None) -> Photo:
-    """A `Photo` without camera or mask. Raises UserError when camera and file have different shapes."""
+def photo_from(
+    frame: Frame, header: Header, max_side: int | None, normals: dict[str, Path] | None = None
+) -> Photo:
+    """A `Photo` without camera or mask. Raises UserError when camera and file have different
+    shapes."""
     w, h, upright = header.width, header.height, True
     camera = frame.camera
     if camera is not None and abs(camera.width / camera.height - w / h) > 0.02 * (w / h):
         if header.turned and abs(camera.width / camera.height - h / w) < 0.02 * (h / w):
-            w, h, upright = h, w, False  # calibrated on the picture as stored, before EXIF turned it
+            w, h, upright = (
+                h,
+                w,
+                False,
+            )  # calibrated on the picture as stored, before EXIF turned it
         else:
             raise UserError(
                 f"camera and photo have different shapes: {camera.width} x {camera.height} and {w} x {h} pixels ('{frame.name}')",
@@ -165,8 +205,11 @@ def photo_from(frame: Frame, header: Header, max_side: int | None, normals: dict
         size = (w, h)
     focal = None if header.focal is None else header.focal * size[0] / w
     normal = find_normal(frame.path, normals or {})
-    # of a photo that is left as stored, a mask of the other shape was made from the upright picture and is turned back
-    orientation = header.orientation if upright else {6: 8, 8: 6}.get(header.orientation, header.orientation)
+    # of a photo that is left as stored, a mask of the other shape was made from the upright picture
+    # and is turned back
+    orientation = (
+        header.orientation if upright else {6: 8, 8: 6}.get(header.orientation, header.orientation)
+    )
     decoder = Decoder(frame.path, size, upright, normal=normal, orientation=orientation)
     return Photo(frame.name, decoder, *size, focal_hint=focal, flash_energy=frame.flash_energy)
 
@@ -174,14 +217,19 @@ def photo_from(frame: Frame, header: Header, max_side: int | None, normals: dict
 # ---------------------------------------------------------------- masks and normals from files
 
 
-def file_mask(path: Path, shape: tuple[int, int], invert: bool = False, orientation: int = 1) -> np.ndarray:
+def file_mask(
+    path: Path, shape: tuple[int, int], invert: bool = False, orientation: int = 1
+) -> np.ndarray:
     """A mask file at the size of its photo (H, W). Raises UserError when the shapes differ."""
     mask = fitted_mask(read_mask(path), shape, orientation, path)
     return 1.0 - mask if invert else mask
 
 
-def fitted_mask(mask: np.ndarray, shape: tuple[int, int], orientation: int, source: Path | str) -> np.ndarray:
-    """A mask (H', W') at the size of its photo, upright, float32. Raises UserError when the shapes differ."""
+def fitted_mask(
+    mask: np.ndarray, shape: tuple[int, int], orientation: int, source: Path | str
+) -> np.ndarray:
+    """A mask (H', W') at the size of its photo, upright, float32. Raises UserError when the shapes
+    differ."""
     mask = upright_mask(mask, shape, orientation)
     h, w = shape
     if mask.shape != (h, w):
@@ -191,7 +239,9 @@ def fitted_mask(mask: np.ndarray, shape: tuple[int, int], orientation: int, sour
                 "the mask belongs to another photo, or one of them was turned",
                 f"make it again from the photo: {source}",
             )
-        mask = cv2.resize(mask, (w, h), interpolation=cv2.INTER_AREA if mask.shape[0] > h else cv2.INTER_LINEAR)
+        mask = cv2.resize(
+            mask, (w, h), interpolation=cv2.INTER_AREA if mask.shape[0] > h else cv2.INTER_LINEAR
+        )
     return np.ascontiguousarray(mask, dtype=np.float32)
 
 
@@ -200,12 +250,17 @@ def index_normals(root: Path) -> dict[str, Path]:
     for name in NORMAL_FOLDERS:
         folder = root / name
         if folder.is_dir():
-            return {f.stem.removesuffix("_normal"): f for f in sorted(folder.rglob("*")) if f.suffix.lower() in EXTENSIONS}
+            return {
+                f.stem.removesuffix("_normal"): f
+                for f in sorted(folder.rglob("*"))
+                if f.suffix.lower() in EXTENSIONS
+            }
     return {}
 
 
 def find_normal(photo: Path, index: dict[str, Path]) -> Path | None:
-    """The normal prior of a photo: STEM_normal.png or .exr beside it, or the same stem in the folder that was indexed."""
+    """The normal prior of a photo: STEM_normal.png or .exr beside it, or the same stem in the
+    folder that was indexed."""
     for suffix in (".png", ".exr"):
         beside = photo.parent / f"{photo.stem}_normal{suffix}"
         if beside.is_file():
@@ -214,31 +269,39 @@ def find_normal(photo: Path, index: dict[str, Path]) -> Path | None:
 
 
 def upright_mask(mask: np.ndarray, shape: tuple[int, int], orientation: int) -> np.ndarray:
-    """Turn a mask that was made from the pixels as stored, before EXIF turned the photo; its shape (H, W) tells."""
+    """Turn a mask that was made from the pixels as stored, before EXIF turned the photo; its shape
+    (H, W) tells."""
     wide, upright = mask.shape[1] > mask.shape[0], shape[1] > shape[0]
     return turn_upright(mask, orientation) if orientation >= 5 and wide != upright else mask
 
 
 def read_normal(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) unit normals in OpenCV camera axes, 0 where unknown: a picture maps [-1, 1] to [0, 1], an EXR holds them as they are.
+    """(H, W, 3) unit normals in OpenCV camera axes, 0 where unknown: a picture maps [-1, 1] to [0,
+    1], an EXR holds them as they are.
 
     Unknown is what is far from unit length: black and middle grey of a picture, zero of an EXR.
     """
     data = read_data(path)
     if data.ndim != 3 or data.shape[2] < 3:
-        raise UserError("a normal prior has no three channels", fix=f"write x, y, z as red, green, blue: {path}")
+        raise UserError(
+            "a normal prior has no three channels", fix=f"write x, y, z as red, green, blue: {path}"
+        )
     picture = path.suffix.lower() != ".exr"
     normal = data[..., :3] * 2 - 1 if picture else data[..., :3]
     length = np.linalg.norm(normal, axis=-1)
     known = (length > 0.5) & (length < 1.5) if picture else length > 0.1
     normal = _unit_normals(normal) * known[..., None]
     if normal.shape[:2] != shape:
-        normal = _unit_normals(cv2.resize(np.ascontiguousarray(normal), shape[::-1], interpolation=cv2.INTER_LINEAR))
+        normal = _unit_normals(
+            cv2.resize(np.ascontiguousarray(normal), shape[::-1], interpolation=cv2.INTER_LINEAR)
+        )
     return normal.astype(np.float32)
 
 
 def _unit_normals(normal: np.ndarray) -> np.ndarray:
-    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)).astype(np.float32)
+    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)).astype(
+        np.float32
+    )
 
 
 # ---------------------------------------------------------------- the plain folder
@@ -252,13 +315,20 @@ def recognise(path: Path) -> Path | None:
 
 
 def read(path: Path, found: Path) -> Reading:
-    """All photos of a folder, without cameras. Of a camera that writes two files of every photo the developed one is taken."""
+    """All photos of a folder, without cameras. Of a camera that writes two files of every photo the
+    developed one is taken."""
     files = list_images(found)
     developed = {f.stem for f in files if f.suffix.lower() not in RAW}
     kept = [f for f in files if f.suffix.lower() not in RAW or f.stem not in developed]
     twins = len(files) - len(kept)
-    notes = (f"{twins} RAW files lie beside a developed photo of the same name and are left out",) if twins else ()
-    return Reading("photos", path, tuple(Frame(f, f.relative_to(path).as_posix()) for f in kept), notes=notes)
+    notes = (
+        (f"{twins} RAW files lie beside a developed photo of the same name and are left out",)
+        if twins
+        else ()
+    )
+    return Reading(
+        "photos", path, tuple(Frame(f, f.relative_to(path).as_posix()) for f in kept), notes=notes
+    )
 
 
 def headers_of(frames: tuple[Frame, ...]) -> list[Header]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from relit.cameras.pinhole import Lens, pixels_from_ideal
 from relit.errors import UserError
+from relit.geometry.lens import Lens, pixels_from_ideal
 from relit.scene import Camera, Sphere
 
 FILL = 0.88  # the object's radius as a share of the sphere's
@@ -18,7 +18,8 @@ MOST_VIEWS = 40  # of the masks of a large capture, so many are carved with
 
 @dataclass(frozen=True)
 class View:
-    """What the sphere is found from: a camera as calibrated, its lens, a small mask (h, w) of the same shape or None, the photo's name."""
+    """What the sphere is found from: a camera as calibrated, its lens, a small mask (h, w) of the
+    same shape or None, the photo's name."""
 
     camera: Camera
     lens: Lens | None = None
@@ -29,7 +30,8 @@ class View:
 def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sphere, str]:
     """-> (sphere, how it was found). Masks go first, then sparse points, then the cameras alone.
 
-    Raises UserError when the cameras look away from each other, so that no sphere is seen by most of them.
+    Raises UserError when the cameras look away from each other, so that no sphere is seen by most
+    of them.
     """
     if sum(v.mask is not None for v in views) >= max(2, 0.5 * len(views)):
         return sphere_from_masks([v for v in views if v.mask is not None]), "the masks"
@@ -41,9 +43,12 @@ def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sp
     return sphere, "the cameras' viewing directions"
 
 
-def settled_sphere(known: Sphere | None, presumed: bool, views: list[View], points: np.ndarray | None = None) -> tuple[Sphere, str]:
-    """The `known` sphere and "", or as `find_sphere`. presumed: the known one is but a convention, so where all views have masks these
-    tell; the convention stands where they contradict one another. Raises UserError as `find_sphere`."""
+def settled_sphere(
+    known: Sphere | None, presumed: bool, views: list[View], points: np.ndarray | None = None
+) -> tuple[Sphere, str]:
+    """The `known` sphere and "", or as `find_sphere`. presumed: the known one is but a convention,
+    so where all views have masks these tell; the convention stands where they contradict one
+    another. Raises UserError as `find_sphere`."""
     if known is not None and not (presumed and all(v.mask is not None for v in views)):
         return known, ""
     try:
@@ -57,9 +62,11 @@ def settled_sphere(known: Sphere | None, presumed: bool, views: list[View], poin
 # ---------------------------------------------------------------- rays
 
 
-def closest_point(origins: np.ndarray, directions: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """The point (3,) with the least sum of squared distances to rays (N, 3), (N, 3); damped towards the mean origin for parallel rays, and
-    that origin where numbers are too large to tell."""
+def closest_point(
+    origins: np.ndarray, directions: np.ndarray, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """The point (3,) with the least sum of squared distances to rays (N, 3), (N, 3); damped towards
+    the mean origin for parallel rays, and that origin where numbers are too large to tell."""
     d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
     across = across * (np.ones(len(d)) if weights is None else weights)[:, None, None]
@@ -72,7 +79,8 @@ def closest_point(origins: np.ndarray, directions: np.ndarray, weights: np.ndarr
 
 
 def robust_closest_point(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """`closest_point`, reweighted ten times by 1 / distance so that a few stray cameras do not move it."""
+    """`closest_point`, reweighted ten times by 1 / distance so that a few stray cameras do not move
+    it."""
     weights = np.ones(len(origins))
     for _ in range(10):
         c = closest_point(origins, directions, weights)
@@ -82,8 +90,9 @@ def robust_closest_point(origins: np.ndarray, directions: np.ndarray) -> np.ndar
 
 
 def sphere_from_rays(cameras: list[Camera]) -> Sphere:
-    """Sphere about the point nearest to all optical axes, as large as the longer side of the median picture shows, if no camera stands
-    in it. What it does not hold cannot be reconstructed; what it holds besides the object costs only resolution.
+    """Sphere about the point nearest to all optical axes, as large as the longer side of the median
+    picture shows, if no camera stands in it. What it does not hold cannot be reconstructed; what it
+    holds besides the object costs only resolution.
 
     Raises UserError when most cameras do not see that point.
     """
@@ -92,7 +101,13 @@ def sphere_from_rays(cameras: list[Camera]) -> Sphere:
     centre = robust_closest_point(origins, axes)
     seen = _seen(cameras, centre)
     distance = np.linalg.norm(origins - centre, axis=1)[seen]
-    half = np.array([np.arctan(0.5 * max(c.width / c.fx, c.height / c.fy)) for c, s in zip(cameras, seen, strict=True) if s])
+    half = np.array(
+        [
+            np.arctan(0.5 * max(c.width / c.fx, c.height / c.fy))
+            for c, s in zip(cameras, seen, strict=True)
+            if s
+        ]
+    )
     radius = min(float(np.median(distance * np.sin(half))), 0.8 * float(distance.min()))
     return Sphere(centre, radius)
 
@@ -101,7 +116,9 @@ def _seen(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
     """(N,) bool: which cameras see a point. Raises UserError when fewer than 60 % do."""
     pixels = np.array([c.project(point) for c in cameras])
     size = np.array([(c.width, c.height) for c in cameras])
-    seen = (pixels[:, 2] > 0) & (pixels[:, :2] >= 0).all(axis=1) & (pixels[:, :2] <= size).all(axis=1)
+    seen = (
+        (pixels[:, 2] > 0) & (pixels[:, :2] >= 0).all(axis=1) & (pixels[:, :2] <= size).all(axis=1)
+    )
     if seen.mean() < 0.6:
         raise UserError(
             f"the cameras look away from each other: only {seen.sum()} of {len(seen)} see the point that their axes approach most",
@@ -118,13 +135,17 @@ def _seen(cameras: list[Camera], point: np.ndarray) -> np.ndarray:
 def sphere_from_points(points: np.ndarray) -> Sphere:
     """Sphere about (N, 3) points of the object, the farthest 2 % left out."""
     centre = np.median(points, axis=0)
-    near = points[np.linalg.norm(points - centre, axis=1) <= np.quantile(np.linalg.norm(points - centre, axis=1), 0.98)]
+    near = points[
+        np.linalg.norm(points - centre, axis=1)
+        <= np.quantile(np.linalg.norm(points - centre, axis=1), 0.98)
+    ]
     centre, radius = smallest_ball(near)
     return Sphere(centre, radius / FILL)
 
 
 def smallest_ball(points: np.ndarray, steps: int = 400) -> tuple[np.ndarray, float]:
-    """Smallest enclosing ball of (N, 3) points to about 0.3 %, by Badoiu and Clarkson 2003: step 1/(i+1) towards the farthest."""
+    """Smallest enclosing ball of (N, 3) points to about 0.3 %, by Badoiu and Clarkson 2003: step
+    1/(i+1) towards the farthest."""
     centre = 0.5 * (points.min(0) + points.max(0))
     for i in range(1, steps + 1):
         far = points[np.argmax(((points - centre) ** 2).sum(1))]
@@ -136,7 +157,8 @@ def smallest_ball(points: np.ndarray, steps: int = 400) -> tuple[np.ndarray, flo
 
 
 def sphere_from_masks(views: list[View]) -> Sphere:
-    """Sphere about the visual hull: cells of a coarse grid that fall into the mask of (nearly) every view that shows them.
+    """Sphere about the visual hull: cells of a coarse grid that fall into the mask of (nearly)
+    every view that shows them.
 
     Raises UserError when the masks of different photos have no place in common.
     """
@@ -161,7 +183,9 @@ def sphere_from_masks(views: list[View]) -> Sphere:
     return Sphere(centre, (reach + 0.5 * float(np.linalg.norm(cell))) / FILL)
 
 
-def _disagreement(views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np.ndarray) -> UserError:
+def _disagreement(
+    views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np.ndarray
+) -> UserError:
     """Names the masks that miss what the others show, where a third of them or fewer does."""
     what = "the masks of different photos have no place in common"
     kept, _ = _carve(views, masks, low, high, spare=1 / 3)
@@ -173,7 +197,11 @@ def _disagreement(views: list[View], masks: list[np.ndarray], low: np.ndarray, h
     if len(kept) and misses and all(misses) and len(misses) <= len(views) / 3:
         named = ", ".join(misses[:6]) + (", ..." if len(misses) > 6 else "")
         why = f"most of them share a place, but these masks do not hold it: {named}"
-        return UserError(what, why, "correct those masks (relit inspect INPUT --edit) or leave those photos out, or use --masks none")
+        return UserError(
+            what,
+            why,
+            "correct those masks (relit inspect INPUT --edit) or leave those photos out, or use --masks none",
+        )
     return UserError(
         what,
         "masks and cameras do not belong together, the poses use other axes than the format says, or the masks show different things",
@@ -182,11 +210,14 @@ def _disagreement(views: list[View], masks: list[np.ndarray], low: np.ndarray, h
 
 
 def _mask_cone(view: View) -> tuple[np.ndarray, float]:
-    """World direction (3,) through the middle of a mask, and the half angle of the cone that holds it."""
+    """World direction (3,) through the middle of a mask, and the half angle of the cone that holds
+    it."""
     h, w = view.mask.shape
     c = view.camera.resized(w, h)
     rows, cols = np.nonzero(view.mask > 0.5)
-    directions = np.stack([(cols + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(rows))], axis=1)
+    directions = np.stack(
+        [(cols + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(rows))], axis=1
+    )
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     middle = 0.5 * (directions.min(0) + directions.max(0))
     middle /= np.linalg.norm(middle)
@@ -194,8 +225,11 @@ def _mask_cone(view: View) -> tuple[np.ndarray, float]:
     return c.world_from_camera[:3, :3] @ middle, min(angle, 1.2)
 
 
-def _shown(view: View, shape: tuple[int, int], points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of points (K, 3): whether they fall into the picture (K,), and the column and row of its (h, w) copy that they fall on."""
+def _shown(
+    view: View, shape: tuple[int, int], points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points (K, 3): whether they fall into the picture (K,), and the column and row of its (h,
+    w) copy that they fall on."""
     h, w = shape
     c = view.camera.resized(w, h)
     m = c.camera_from_world
@@ -208,8 +242,11 @@ def _shown(view: View, shape: tuple[int, int], points: np.ndarray) -> tuple[np.n
     return inside, pixel[:, 0], pixel[:, 1]
 
 
-def _carve(views: list[View], masks: list[np.ndarray], low, high, spare: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
-    """-> (centres (K, 3) of the cells that stay, size (3,) of a cell). A cell must be shown by half of the views, and two at least.
+def _carve(
+    views: list[View], masks: list[np.ndarray], low, high, spare: float = 0.05
+) -> tuple[np.ndarray, np.ndarray]:
+    """-> (centres (K, 3) of the cells that stay, size (3,) of a cell). A cell must be shown by half
+    of the views, and two at least.
 
     spare: of 20 views or more, so large a share may have a hole in their mask.
     """
@@ -220,7 +257,8 @@ def _carve(views: list[View], masks: list[np.ndarray], low, high, spare: float =
     several = spare * len(views) if len(views) >= 20 or spare > 0.05 else 0
     for view, mask in zip(views, masks, strict=True):
         inside, column, row = _shown(view, mask.shape, points)
-        # a mask that keeps off the picture's border shows the whole object: there is none of it outside the picture
+        # a mask that keeps off the picture's border shows the whole object: there is none of it
+        # outside the picture
         whole = not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
         shown += inside | whole
         hit[inside] += mask[row[inside], column[inside]]
@@ -233,7 +271,8 @@ def _carve(views: list[View], masks: list[np.ndarray], low, high, spare: float =
 
 
 def check_sphere(sphere: Sphere, cameras: list[Camera]) -> list[str]:
-    """Notes on a sphere that some cameras do not see. Raises UserError when most do not, or when it is no sphere."""
+    """Notes on a sphere that some cameras do not see. Raises UserError when most do not, or when it
+    is no sphere."""
     if not (np.isfinite(sphere.centre).all() and np.isfinite(sphere.radius) and sphere.radius > 0):
         raise UserError(
             "the object sphere is not valid",
@@ -247,7 +286,11 @@ def check_sphere(sphere: Sphere, cameras: list[Camera]) -> list[str]:
             f"its centre is {np.round(sphere.centre, 3).tolist()}, its radius {sphere.radius:.3g}, in the units of the cameras",
             "give another sphere, or leave it out so that it is found",
         )
-    notes = [f"the object sphere lies outside the view of {len(unseen)} of {len(cameras)} cameras"] if unseen else []
+    notes = (
+        [f"the object sphere lies outside the view of {len(unseen)} of {len(cameras)} cameras"]
+        if unseen
+        else []
+    )
     within = sum(np.linalg.norm(c.centre - sphere.centre) < sphere.radius for c in cameras)
     if within:
         notes.append(f"{within} of {len(cameras)} cameras stand inside the object sphere")
@@ -255,7 +298,8 @@ def check_sphere(sphere: Sphere, cameras: list[Camera]) -> list[str]:
 
 
 def _touches(camera: Camera, sphere: Sphere) -> bool:
-    """True when the projected sphere's centre, or the point of it nearest to the optical axis, falls into the picture."""
+    """True when the projected sphere's centre, or the point of it nearest to the optical axis,
+    falls into the picture."""
     q = (camera.camera_from_world @ np.append(sphere.centre, 1.0))[:3]
     if q[2] + sphere.radius <= 0:
         return False
@@ -267,9 +311,11 @@ def _touches(camera: Camera, sphere: Sphere) -> bool:
 
 
 def up_direction(cameras: list[Camera]) -> np.ndarray | None:
-    """(3,) unit up direction of the world, or None: normal to the cameras' x axes, which photographers hold level.
+    """(3,) unit up direction of the world, or None: normal to the cameras' x axes, which
+    photographers hold level.
 
-    Snapped to a coordinate axis within 3 degrees. None when the axes tell nothing (rolled cameras, one viewpoint, half upside down).
+    Snapped to a coordinate axis within 3 degrees. None when the axes tell nothing (rolled cameras,
+    one viewpoint, half upside down).
     """
     x = np.array([c.world_from_camera[:3, 0] for c in cameras])
     image_up = -np.array([c.world_from_camera[:3, 1] for c in cameras])

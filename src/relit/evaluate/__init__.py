@@ -1,5 +1,0 @@
-"""Figures of a reconstruction against the truth."""
-
-from relit.evaluate.protocols import evaluate
-
-__all__ = ["evaluate"]

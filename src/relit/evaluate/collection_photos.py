@@ -1,7 +1,9 @@
-"""What is measured on the asset of a collection against photographs: held-out photos, and the cameras where the capture knows them.
+"""What is measured on the asset of a collection against photographs: held-out photos, and the
+cameras where the capture knows them.
 
-The truth is the capture itself. A held-out photo (`--set holdout=16`, held_out.json) has its own camera and light in the asset, fitted with
-shape and material frozen; cameras are compared after Procrustes, whichever file they stand in.
+The truth is the capture itself. A held-out photo (`--set holdout=16`, held_out.json) has its own
+camera and light in the asset, fitted with shape and material frozen; cameras are compared after
+Procrustes, whichever file they stand in.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from relit.capture import llff
+from relit.capture.readers import llff
 from relit.errors import UserError
 from relit.evaluate.collection import DEFINITIONS, check_lights, picture_figures, pose_figures
 from relit.evaluate.photos import SIDE, capture_of, shrunk
@@ -20,18 +22,29 @@ from relit.masks.grabcut import centre_cut
 from relit.scene import Asset, Camera, Capture, Photo
 
 
-def evaluate_on_collection(asset: Asset, folder: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0) -> dict[str, Any]:
-    """The figures of an asset against the photos that it was made from. run: the run folder, whose settings say how they were read.
+def evaluate_on_collection(
+    asset: Asset, folder: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0
+) -> dict[str, Any]:
+    """The figures of an asset against the photos that it was made from. run: the run folder, whose
+    settings say how they were read.
 
-    Returns as `protocols.evaluate`. Raises UserError when no photo was set aside and no true camera is known.
+    Returns as `dispatch.evaluate`. Raises UserError when no photo was set aside and no true camera
+    is known.
     """
     check_lights(asset)
     capture = capture_of(folder, run)
     photos = {p.name: p for p in (*capture.photos, *capture.held_out)}
-    found = {name: (camera, light) for (name, camera), light in zip(asset.cameras, asset.lights, strict=True)}
+    found = {
+        name: (camera, light)
+        for (name, camera), light in zip(asset.cameras, asset.lights, strict=True)
+    }
     if not set(found) & set(photos):
         why = f"the asset's: {', '.join(list(found)[:3])} ...; the folder's: {', '.join(list(photos)[:3])} ..."
-        raise UserError("none of the asset's photos is in the folder", why, f"give the folder that the run was made from: {folder}")
+        raise UserError(
+            "none of the asset's photos is in the folder",
+            why,
+            f"give the folder that the run was made from: {folder}",
+        )
     held = [name for name in asset.meta.get("held_out", ()) if name in found and name in photos]
     truth, source = true_cameras(capture)
     train = {name: camera for name, camera in truth.items() if name in found and name not in held}
@@ -46,10 +59,15 @@ def evaluate_on_collection(asset: Asset, folder: Path, *, run: Path | None = Non
     notes = {}
     if len(train) >= 3:
         test = {name: truth[name] for name in held if name in truth}
-        values, _, turned = pose_figures({n: c for n, (c, _) in found.items()}, train, test, middle_of(train))
+        values, _, turned = pose_figures(
+            {n: c for n, (c, _) in found.items()}, train, test, middle_of(train)
+        )
         for name, figures in turned.items():
             per_view[name].update(figures)
-        notes = dict.fromkeys([*values, "held_out_rotation"], f"; the capture's own cameras ({source}) stand for the true ones")
+        notes = dict.fromkeys(
+            [*values, "held_out_rotation"],
+            f"; the capture's own cameras ({source}) stand for the true ones",
+        )
     guessed = 0
     for i, name in enumerate(held):
         reference, cut = reference_of(photos[name])
@@ -57,21 +75,39 @@ def evaluate_on_collection(asset: Asset, folder: Path, *, run: Path | None = Non
         per_view[name].update(picture_figures(asset, *found[name], reference, spp, seed + i))
     masks = f", {guessed} of {len(held)} guessed by GrabCut as the fit does" if guessed else ""
     for key in ("novel_psnr", "novel_ssim", "novel_psnr_masked", "novel_mask_iou"):
-        notes[key] = f"; photos shrunk to at most {SIDE} pixels a side, their masks for the true coverage{masks}"
+        notes[key] = (
+            f"; photos shrunk to at most {SIDE} pixels a side, their masks for the true coverage{masks}"
+        )
     for key in sorted({k for figures in per_view.values() for k in figures}):
-        values[key] = float(np.nanmean([figures[key] for figures in per_view.values() if key in figures]))
-    noted = {name: (unit, text + notes[name]) for name, (unit, text) in DEFINITIONS.items() if name in values}
-    return {"metrics": entries(values, noted), "per_view": per_view, "photos": len(held), "alignment": "sim3"}
+        values[key] = float(
+            np.nanmean([figures[key] for figures in per_view.values() if key in figures])
+        )
+    noted = {
+        name: (unit, text + notes[name])
+        for name, (unit, text) in DEFINITIONS.items()
+        if name in values
+    }
+    return {
+        "metrics": entries(values, noted),
+        "per_view": per_view,
+        "photos": len(held),
+        "alignment": "sim3",
+    }
 
 
 def true_cameras(capture: Capture) -> tuple[dict[str, Camera], str]:
-    """Cameras by the photos' names and where they come from: the capture's own, else those of a poses_bounds.npy that lies beside hints;
-    ({}, '') where there are none. Raises UserError for a poses_bounds.npy that is not of these photos."""
+    """Cameras by the photos' names and where they come from: the capture's own, else those of a
+    poses_bounds.npy that lies beside hints; ({}, '') where there are none. Raises UserError for a
+    poses_bounds.npy that is not of these photos."""
     own = {p.name: p.camera for p in (*capture.photos, *capture.held_out) if p.camera is not None}
     if own:
         return own, capture.format
     file = llff.recognise(capture.root)  # quadrants.json goes before it when a folder is read
-    return ({}, "") if file is None else ({f.name: f.camera for f in llff.read(capture.root, file).frames}, file.name)
+    return (
+        ({}, "")
+        if file is None
+        else ({f.name: f.camera for f in llff.read(capture.root, file).frames}, file.name)
+    )
 
 
 def middle_of(cameras: dict[str, Camera]) -> np.ndarray:
@@ -85,10 +121,19 @@ def middle_of(cameras: dict[str, Camera]) -> np.ndarray:
 
 
 def reference_of(photo: Photo) -> tuple[np.ndarray, bool]:
-    """The photo as (H, W, 4) linear, premultiplied by its mask on black, at most SIDE pixels a side; and whether the mask is a guess."""
+    """The photo as (H, W, 4) linear, premultiplied by its mask on black, at most SIDE pixels a
+    side; and whether the mask is a guess."""
     pixels = photo.load()
     factor = min(1.0, SIDE / max(photo.width, photo.height))
-    size = Camera(max(1, round(photo.width * factor)), max(1, round(photo.height * factor)), 1.0, 1.0, 0.0, 0.0, np.eye(4))
+    size = Camera(
+        max(1, round(photo.width * factor)),
+        max(1, round(photo.height * factor)),
+        1.0,
+        1.0,
+        0.0,
+        0.0,
+        np.eye(4),
+    )
     rgb, mask = shrunk(pixels.rgb, size), shrunk(pixels.mask, size)
     guessed = mask is None
     mask = np.clip(centre_cut(rgb) if guessed else mask, 0, 1)[..., None].astype(np.float32)

@@ -1,11 +1,13 @@
 """Every figure that Relit reports, in NumPy, each with the definition it is printed with.
 
-Papers differ by up to 2 dB in what they call the same figure (mask, colour space, scale, window), so nothing here has a
+Papers differ by up to 2 dB in what they call the same figure (mask, colour space, scale, window),
+so nothing here has a
 hidden choice: `DEFINITIONS` holds the sentence that stands beside each number.
 
-Images are (H, W, 3) float32 linear, premultiplied on black. A picture figure is taken after clipping to [0, 1] and sRGB
-encoding, in two conventions: over the whole frame (black outside the object; easy background pixels raise it) and inside the
-mask (truth coverage >= MASK; strict).
+Images are (H, W, 3) float32 linear, premultiplied on black. A picture figure is taken after
+clipping to [0, 1] and sRGB
+encoding, in two conventions: over the whole frame (black outside the object; easy background pixels
+raise it) and inside the mask (truth coverage >= MASK; strict).
 """
 
 from __future__ import annotations
@@ -41,8 +43,8 @@ def encode(linear):
 def psnr(a, b, where=None, peak: float = 1.0) -> float:
     """Peak signal-to-noise ratio in dB of two arrays in the space they are given in.
 
-    where: (H, W) bool, the pixels that count, or None for all. Equal arrays give 100, the largest figure returned;
-    no pixel at all gives nan.
+    where: (H, W) bool, the pixels that count, or None for all. Equal arrays give 100, the largest
+    figure returned; no pixel at all gives nan.
     """
     error = np.square(np.asarray(a, np.float64) - np.asarray(b, np.float64))
     if where is not None:
@@ -55,20 +57,24 @@ def psnr(a, b, where=None, peak: float = 1.0) -> float:
 def ssim_map(a, b) -> np.ndarray:
     """Structural similarity (H, W) of two (H, W) or (H, W, C) arrays in [0, 1], mean over channels.
 
-    Wang et al. 2004, Eq. 13: Gaussian window of 11 x 11 pixels with sigma 1.5, C1 = .01^2, C2 = .03^2, population moments,
-    frame edges reflected.
+    Wang et al. 2004, Eq. 13: Gaussian window of 11 x 11 pixels with sigma 1.5, C1 = .01^2, C2 =
+    .03^2, population moments, frame edges reflected.
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if a.ndim == 2:
         a, b = a[..., None], b[..., None]
 
     def blur(x):
-        return gaussian_filter(x, (SSIM_SIGMA, SSIM_SIGMA, 0), radius=(SSIM_RADIUS, SSIM_RADIUS, 0), mode="reflect")
+        return gaussian_filter(
+            x, (SSIM_SIGMA, SSIM_SIGMA, 0), radius=(SSIM_RADIUS, SSIM_RADIUS, 0), mode="reflect"
+        )
 
     mu_a, mu_b = blur(a), blur(b)
     var_a, var_b, cov = blur(a * a) - mu_a**2, blur(b * b) - mu_b**2, blur(a * b) - mu_a * mu_b
     c1, c2 = 0.01**2, 0.03**2
-    s = ((2 * mu_a * mu_b + c1) * (2 * cov + c2)) / ((mu_a**2 + mu_b**2 + c1) * (var_a + var_b + c2))
+    s = ((2 * mu_a * mu_b + c1) * (2 * cov + c2)) / (
+        (mu_a**2 + mu_b**2 + c1) * (var_a + var_b + c2)
+    )
     return s.mean(-1)
 
 
@@ -79,7 +85,8 @@ def ssim(a, b, where=None) -> float:
 
 
 def normal_angles(predicted, truth) -> np.ndarray:
-    """Angle (...) in degrees between (..., 3) normals, normalised first; 90 where the prediction is zero (no surface there)."""
+    """Angle (...) in degrees between (..., 3) normals, normalised first; 90 where the prediction is
+    zero (no surface there)."""
     p, t = np.asarray(predicted, np.float64), np.asarray(truth, np.float64)
     length = np.linalg.norm(p, axis=-1)
     t = t / np.maximum(np.linalg.norm(t, axis=-1, keepdims=True), 1e-12)
@@ -90,17 +97,22 @@ def normal_angles(predicted, truth) -> np.ndarray:
 
 
 def albedo_scale(predicted, truth) -> np.ndarray:
-    """Per-channel factor (3,) that takes the predicted albedo to the true one: sum(truth) / sum(predicted) over (N, 3) linear
-    samples (SfD's evaluation, there in gamma space). Albedo and light share a scale that photographs cannot settle."""
-    p, t = np.asarray(predicted, np.float64).reshape(-1, 3), np.asarray(truth, np.float64).reshape(-1, 3)
+    """Per-channel factor (3,) that takes the predicted albedo to the true one: sum(truth) /
+    sum(predicted) over (N, 3) linear samples (SfD's evaluation, there in gamma space). Albedo and
+    light share a scale that photographs cannot settle."""
+    p, t = (
+        np.asarray(predicted, np.float64).reshape(-1, 3),
+        np.asarray(truth, np.float64).reshape(-1, 3),
+    )
     total = p.sum(0)
     return np.where(total > 1e-9, t.sum(0) / np.maximum(total, 1e-9), 1.0)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Points on a triangle mesh. points: (N, 3) float64. triangle: (N,) the face each lies on. uniform: (N,) bool, true for samples
-    uniform by area, false for face centres, which make sure that a face between samples is found. corners: (F, 3, 3) of the faces."""
+    """Points on a triangle mesh. points: (N, 3) float64. triangle: (N,) the face each lies on.
+    uniform: (N,) bool, true for samples uniform by area, false for face centres, which make sure
+    that a face between samples is found. corners: (F, 3, 3) of the faces."""
 
     points: np.ndarray
     triangle: np.ndarray
@@ -118,7 +130,8 @@ def sample_surface(vertices, faces, count: int, seed: int = 0) -> Surface:
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.linalg.norm(np.cross(e1, e2), axis=1)
     rng = np.random.default_rng(seed)
-    # stratified over the cumulated area: less noise in a distance between samples than independent draws
+    # stratified over the cumulated area: less noise in a distance between samples than independent
+    # draws
     position = (np.arange(count) + rng.random(count)) / count * area.sum()
     index = np.minimum(np.searchsorted(np.cumsum(area), position), len(corners) - 1)
     u, w = rng.random(count), rng.random(count)
@@ -134,8 +147,8 @@ def sample_surface(vertices, faces, count: int, seed: int = 0) -> Surface:
 
 
 def closest_on_triangles(p, a, b, c) -> np.ndarray:
-    """Nearest points (..., 3) to p (..., 3) on the triangles a b c (each (..., 3)): the plane's foot where it lies inside, else the
-    nearest of the three edges."""
+    """Nearest points (..., 3) to p (..., 3) on the triangles a b c (each (..., 3)): the plane's
+    foot where it lies inside, else the nearest of the three edges."""
 
     def dot(x, y):
         return (x * y).sum(-1, keepdims=True)
@@ -155,41 +168,53 @@ def closest_on_triangles(p, a, b, c) -> np.ndarray:
 
 
 def distance_to_surface(points, surface: Surface, candidates: int = 8) -> np.ndarray:
-    """(N,) distance from points (N, 3) to the triangles under the `candidates` nearest points of a surface, in the points' unit.
+    """(N,) distance from points (N, 3) to the triangles under the `candidates` nearest points of a
+    surface, in the points' unit.
 
-    Exact between the surface's points, so a mesh against itself gives nearly 0, not the spacing of samples.
+    Exact between the surface's points, so a mesh against itself gives nearly 0, not the spacing of
+    samples.
     """
     k = min(candidates, len(surface.points))
     near = cKDTree(surface.points).query(points, k=k, workers=-1)[1].reshape(len(points), k)
     a, b, c = (surface.corners[surface.triangle[near], i] for i in range(3))
     p = np.asarray(points, np.float64)[:, None]
-    return np.linalg.norm(closest_on_triangles(np.broadcast_to(p, a.shape), a, b, c) - p, axis=-1).min(1)
+    return np.linalg.norm(
+        closest_on_triangles(np.broadcast_to(p, a.shape), a, b, c) - p, axis=-1
+    ).min(1)
 
 
 def chamfer(a: Surface, b: Surface) -> tuple[float, float, float]:
-    """(mean of the two, a to b, b to a): mean distance from the samples of each surface to the other surface. Not squared."""
-    to_b, to_a = (float(distance_to_surface(x.points[x.uniform], y).mean()) for x, y in ((a, b), (b, a)))
+    """(mean of the two, a to b, b to a): mean distance from the samples of each surface to the
+    other surface. Not squared."""
+    to_b, to_a = (
+        float(distance_to_surface(x.points[x.uniform], y).mean()) for x, y in ((a, b), (b, a))
+    )
     return 0.5 * (to_a + to_b), to_b, to_a
 
 
 def resize_environment(environment, height: int = 256, width: int = 512) -> np.ndarray:
-    """Lat-long map (H, W, 3) resampled to height x width: area average where it shrinks, bilinear where it grows."""
+    """Lat-long map (H, W, 3) resampled to height x width: area average where it shrinks, bilinear
+    where it grows."""
     import cv2
 
     e = np.ascontiguousarray(environment, np.float32)
     shrink = e.shape[0] >= height and e.shape[1] >= width
-    return cv2.resize(e, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
+    return cv2.resize(
+        e, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
+    )
 
 
 def environment_mse(predicted, truth) -> float:
-    """SfD's figure: MSE of two lat-long maps resampled to 256 x 512, clipped to [0, 1] and raised to 1/2.2, every texel alike."""
+    """SfD's figure: MSE of two lat-long maps resampled to 256 x 512, clipped to [0, 1] and raised
+    to 1/2.2, every texel alike."""
     p, t = (np.clip(resize_environment(e), 0, 1) ** (1 / 2.2) for e in (predicted, truth))
     return float(np.mean((p - t) ** 2))
 
 
 def environment_log_rmse(predicted, truth) -> float:
-    """Root mean square of the difference of log2 radiance (in stops), per solid angle, at 32 x 64, radiance below 1 % of the truth's
-    mean raised to that. Unlike the clipped figure it sees the strength of lamps and the sun."""
+    """Root mean square of the difference of log2 radiance (in stops), per solid angle, at 32 x 64,
+    radiance below 1 % of the truth's mean raised to that. Unlike the clipped figure it sees the
+    strength of lamps and the sun."""
     p, t = (resize_environment(e, 32, 64).astype(np.float64) for e in (predicted, truth))
     weight = environment_solid_angles(32, 64)[..., None]
     floor = 0.01 * (t * weight).sum() / (3 * weight.sum())

@@ -1,8 +1,9 @@
-"""What is measured against photographs: the asset from the cameras of photos that the fit never saw, under the recovered light: an
-environment, or the flash that moves with each camera.
+"""What is measured against photographs: the asset from the cameras of photos that the fit never
+saw, under the recovered light: an environment, or the flash that moves with each camera.
 
-The truth is the capture itself. Where it sets photos aside (held-out frames of its format) those are compared; where it does not, the
-photos of the fit are, under another name ('seen_'): they show how well the asset explains what it was made from, not more.
+The truth is the capture itself. Where it sets photos aside (held-out frames of its format) those
+are compared; where it does not, the photos of the fit are, under another name ('seen_'): they show
+how well the asset explains what it was made from, not more.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from relit.capture.flash_energy import flash_photos
 from relit.conventions import sample_environment
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.align import aligned, pose_errors
+from relit.evaluate.alignment import aligned, pose_errors
 from relit.evaluate.results import entries
 from relit.evaluate.truth import camera_key
 from relit.files import parse_toml
@@ -29,9 +30,15 @@ SEEN = 12  # photos of the fit, evenly chosen, where none is set aside
 _SHOWN = f"photos shrunk to at most {SIDE} pixels a side, {{light}}, recovered or given cameras"
 _FIGURES = {
     "psnr": ("dB", f"{m.DEFINITIONS['psnr']}; the photo is multiplied with its mask"),
-    "psnr_masked": ("dB", f"PSNR in dB of sRGB-encoded pictures clipped to [0, 1], over the pixels whose mask is >= {m.MASK}"),
+    "psnr_masked": (
+        "dB",
+        f"PSNR in dB of sRGB-encoded pictures clipped to [0, 1], over the pixels whose mask is >= {m.MASK}",
+    ),
     "ssim_masked": ("", f"{m.DEFINITIONS['ssim_masked']} (coverage is the photo's mask)"),
-    "mask_iou": ("", "intersection over union of the asset's coverage and the photo's mask, both >= .5"),
+    "mask_iou": (
+        "",
+        "intersection over union of the asset's coverage and the photo's mask, both >= .5",
+    ),
     "psnr_sphere": (
         "dB",
         "PSNR in dB of sRGB-encoded pictures clipped to [0, 1], over all pixels whose ray meets the object sphere; where the asset does "
@@ -47,43 +54,78 @@ _FIGURES = {
 
 
 def definitions(prefix: str, light: str = "recovered light") -> dict[str, tuple[str, str]]:
-    """name -> (unit, definition) of the figures over held-out ('held_out') or seen ('seen') photos."""
-    which = "photos that were set aside and never used in the fit" if prefix == "held_out" else "photos of the fit itself"
+    """name -> (unit, definition) of the figures over held-out ('held_out') or seen ('seen')
+    photos."""
+    which = (
+        "photos that were set aside and never used in the fit"
+        if prefix == "held_out"
+        else "photos of the fit itself"
+    )
     shown = _SHOWN.format(light=light)
-    return {f"{prefix}_{name}": (unit, f"{which}; {shown}: {text}; mean over photos") for name, (unit, text) in _FIGURES.items()}
+    return {
+        f"{prefix}_{name}": (unit, f"{which}; {shown}: {text}; mean over photos")
+        for name, (unit, text) in _FIGURES.items()
+    }
 
 
-def evaluate_on_photos(asset: Asset, folder: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0) -> dict[str, Any]:
-    """The figures of an asset against the photos of its capture. run: the run folder, whose settings say how the capture was read.
+def evaluate_on_photos(
+    asset: Asset, folder: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0
+) -> dict[str, Any]:
+    """The figures of an asset against the photos of its capture. run: the run folder, whose
+    settings say how the capture was read.
 
-    Returns as `protocols.evaluate`. Raises UserError when the folder is no capture, has no cameras, or shares no photo with the asset.
+    Returns as `dispatch.evaluate`. Raises UserError when the folder is no capture, has no cameras,
+    or shares no photo with the asset.
     """
-    from relit.rendering.photographed import as_photographed
+    from relit.reference.photographed import as_photographed
 
     if asset.environment is None and asset.flash is None:
         why = "neither an environment nor a flash: its pictures cannot be compared with photos"
         raise UserError("the asset has no light of its own", why, "use relit relight instead")
     capture = capture_of(folder, run)
     if asset.flash is not None:
-        capture = flash_photos(capture)  # as the fit had them: those that the flash lit, all of one power
+        capture = flash_photos(
+            capture
+        )  # as the fit had them: those that the flash lit, all of one power
     if not capture.has_cameras:
         why = "photos can only be compared from known cameras; those of the run are in a frame of its own"
-        raise UserError("the photos have no cameras and no truth", why, f"give a capture with cameras (docs/formats.md): {folder}")
+        raise UserError(
+            "the photos have no cameras and no truth",
+            why,
+            f"give a capture with cameras (docs/formats.md): {folder}",
+        )
     given = {camera_key(p.name): p.camera for p in capture.photos}
-    asset, alignment = aligned(asset, given, {camera_key(name): camera for name, camera in asset.cameras})
+    asset, alignment = aligned(
+        asset, given, {camera_key(name): camera for name, camera in asset.cameras}
+    )
     photos, prefix = chosen(capture)
     show = as_photographed(asset)
-    per_view = {p.name: photo_figures(show, asset, p, capture.sphere, spp, seed + i) for i, p in enumerate(photos)}
+    per_view = {
+        p.name: photo_figures(show, asset, p, capture.sphere, spp, seed + i)
+        for i, p in enumerate(photos)
+    }
     names = [n for n in _FIGURES if any(n in v for v in per_view.values())]
-    values = {f"{prefix}_{n}": float(np.nanmean([v[n] for v in per_view.values() if n in v])) for n in names}
-    metrics = entries(values, definitions(prefix, "recovered light" if asset.flash is None else "under the recovered moving flash"))
-    metrics |= camera_figures({camera_key(name): c for name, c in asset.cameras}, given) if alignment == "sim3" else {}
+    values = {
+        f"{prefix}_{n}": float(np.nanmean([v[n] for v in per_view.values() if n in v]))
+        for n in names
+    }
+    metrics = entries(
+        values,
+        definitions(
+            prefix, "recovered light" if asset.flash is None else "under the recovered moving flash"
+        ),
+    )
+    metrics |= (
+        camera_figures({camera_key(name): c for name, c in asset.cameras}, given)
+        if alignment == "sim3"
+        else {}
+    )
     return {"metrics": metrics, "per_view": per_view, "photos": len(photos), "alignment": alignment}
 
 
 def capture_of(folder: Path, run: Path | None) -> Capture:
     """The capture, read with the masks and the sphere that the run's config.toml names."""
-    from relit.capture import open_capture
+    from relit.capture.open import open_capture
 
     config = run / "config.toml" if run else None
     said = parse_toml(config.read_text(encoding="utf-8")) if config and config.is_file() else {}
@@ -101,9 +143,11 @@ def chosen(capture: Capture) -> tuple[list[Photo], str]:
     return [capture.photos[i] for i in index], "seen"
 
 
-def photo_figures(show, asset: Asset, photo: Photo, sphere: Sphere | None, spp: int, seed: int) -> dict[str, float]:
-    """Figures of one photo, without prefix: the masked ones where its mask is known, else those of the object sphere. show: see
-    `rendering.photographed.as_photographed`."""
+def photo_figures(
+    show, asset: Asset, photo: Photo, sphere: Sphere | None, spp: int, seed: int
+) -> dict[str, float]:
+    """Figures of one photo, without prefix: the masked ones where its mask is known, else those of
+    the object sphere. show: see `reference.photographed.as_photographed`."""
     pixels, camera = photo.load(), photo.camera
     camera = camera.within(SIDE)
     rgb, mask = (shrunk(a, camera) for a in (pixels.rgb, pixels.mask))
@@ -118,12 +162,20 @@ def photo_figures(show, asset: Asset, photo: Photo, sphere: Sphere | None, spp: 
             "mask_iou": m.mask_iou(alpha, mask),
         }
     d = directions(camera)
-    behind = 0.0 if asset.environment is None else sample_environment(asset.environment, d) * (1 - alpha[..., None])
+    behind = (
+        0.0
+        if asset.environment is None
+        else sample_environment(asset.environment, d) * (1 - alpha[..., None])
+    )
     a, b = m.encode(shown[..., :3] + behind), m.encode(rgb)
     ball = np.ones(alpha.shape, bool) if sphere is None else meets(camera, d, sphere)
     covered = ball & (alpha >= m.MASK)
     share = float(covered.sum() / max(ball.sum(), 1))
-    return {"psnr_sphere": m.psnr(a, b, ball), "psnr_covered": m.psnr(a, b, covered), "covered": share}
+    return {
+        "psnr_sphere": m.psnr(a, b, ball),
+        "psnr_covered": m.psnr(a, b, covered),
+        "covered": share,
+    }
 
 
 def shrunk(image: np.ndarray | None, camera: Camera) -> np.ndarray | None:
@@ -135,7 +187,10 @@ def shrunk(image: np.ndarray | None, camera: Camera) -> np.ndarray | None:
 
 def directions(camera: Camera) -> np.ndarray:
     """(H, W, 3) unit world directions through the pixel centres."""
-    u, v = np.meshgrid((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx, (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy)
+    u, v = np.meshgrid(
+        (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx,
+        (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy,
+    )
     d = np.stack([u, v, np.ones_like(u)], -1) @ np.asarray(camera.world_from_camera)[:3, :3].T
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
@@ -147,8 +202,12 @@ def meets(camera: Camera, d: np.ndarray, sphere: Sphere) -> np.ndarray:
     return (along**2 - (o @ o - sphere.radius**2) > 0) & (sphere.radius - along > 0)
 
 
-def camera_figures(recovered: dict[str, Camera], given: dict[str, Camera]) -> dict[str, dict[str, Any]]:
+def camera_figures(
+    recovered: dict[str, Camera], given: dict[str, Camera]
+) -> dict[str, dict[str, Any]]:
     """How far the recovered cameras, already aligned, are from the given ones."""
     rotations, _ = pose_errors(recovered, given, np.eye(4))
     text = "median rotation error of the recovered cameras against the capture's own, after Sim(3) alignment"
-    return entries({"camera_rotation": float(np.median(rotations))}, {"camera_rotation": ("degrees", text)})
+    return entries(
+        {"camera_rotation": float(np.median(rotations))}, {"camera_rotation": ("degrees", text)}
+    )

@@ -1,21 +1,28 @@
-"""The recovered pile laid on the true one. The photo's camera is known, so they differ by one scale about that camera, which a photo does
-not know, and by the choice of the object's own frame: the one that agrees best with all registered instances.
+"""The recovered pile laid on the true one. The photo's camera is known, so they differ by one scale
+about that camera, which a photo does not know, and by the choice of the object's own frame: the one
+that agrees best with all registered instances.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from relit.cameras.se3 import nearest_rotation, rotation_angle
 from relit.conventions import move_points, scale_of, similarity
+from relit.geometry.se3 import nearest_rotation, rotation_angle
 from relit.scene import Camera
 
 GUESSED = 0.1  # weight of a first guess beside one instance
 
 
 def object_turn(poses: dict, true_poses: dict) -> np.ndarray:
-    """(3, 3) object_from_true_object: the turn of the object's frame that most registered instances agree on."""
-    turns = np.array([nearest_rotation(poses[k][:3, :3]).T @ nearest_rotation(true_poses[k][:3, :3]) for k in poses])
+    """(3, 3) object_from_true_object: the turn of the object's frame that most registered instances
+    agree on."""
+    turns = np.array(
+        [
+            nearest_rotation(poses[k][:3, :3]).T @ nearest_rotation(true_poses[k][:3, :3])
+            for k in poses
+        ]
+    )
     angles = np.array([[rotation_angle(a.T @ b) for b in turns] for a in turns])
     middle = int(np.argmin(np.median(angles, axis=1)))
     near = angles[middle] <= max(3 * float(np.median(angles[middle])), 1.0)
@@ -25,9 +32,10 @@ def object_turn(poses: dict, true_poses: dict) -> np.ndarray:
 def scene_alignment(
     poses: dict, true_poses: dict, photo: Camera, true_points: np.ndarray, vertices: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Of poses world_from_object (4, 4) by label and their truth: the scale about the camera that carries the recovered scene onto the true
-    one; the point (3,) of the recovered object's frame that is the middle of the true one (`scale_about`); and object_from_true_object
-    (4, 4) with the turn of `object_turn`, refined between the surfaces (ICP). vertices: of the recovered object."""
+    """Of poses world_from_object (4, 4) by label and their truth: the scale about the camera that
+    carries the recovered scene onto the true one; the point (3,) of the recovered object's frame
+    that is the middle of the true one (`scale_about`); and object_from_true_object (4, 4) with the
+    turn of `object_turn`, refined between the surfaces (ICP). vertices: of the recovered object."""
     turn = object_turn(poses, true_poses)
     middle = (true_points.min(0) + true_points.max(0)) / 2
     own = (vertices.min(0) + vertices.max(0)) / 2
@@ -37,20 +45,29 @@ def scene_alignment(
     return *scale_about(photo.centre, poses, true_poses, middle, move_points(frame, middle)), frame
 
 
-def scale_about(centre: np.ndarray, poses: dict, true_poses: dict, middle: np.ndarray, guess: np.ndarray) -> tuple[float, np.ndarray]:
-    """(scale, point (3,) of the recovered object's frame) with which the recovered scene, grown about the camera's `centre`, has its
-    objects' points where the true ones have their `middle`: linear least squares over the instances, with less weight for those that are
-    off. guess: (3,) of that point; it counts for little, but where there is one instance alone. Distances tell the scale far better
-    than sizes, a per cent of a distance is a tenth of an object; and the point follows from the poses, as the alignment of two surfaces
-    does not tell it well enough where one has thicker walls."""
+def scale_about(
+    centre: np.ndarray, poses: dict, true_poses: dict, middle: np.ndarray, guess: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """(scale, point (3,) of the recovered object's frame) with which the recovered scene, grown
+    about the camera's `centre`, has its objects' points where the true ones have their `middle`:
+    linear least squares over the instances, with less weight for those that are off. guess: (3,) of
+    that point; it counts for little, but where there is one instance alone. Distances tell the
+    scale far better than sizes, a per cent of a distance is a tenth of an object; and the point
+    follows from the poses, as the alignment of two surfaces does not tell it well enough where one
+    has thicker walls."""
     keys = [k for k in poses if k in true_poses]
     there = np.array([move_points(true_poses[k], middle) - centre for k in keys])
-    rows = np.stack([np.concatenate([(poses[k][:3, 3] - centre)[:, None], poses[k][:3, :3]], 1) for k in keys])
+    rows = np.stack(
+        [np.concatenate([(poses[k][:3, 3] - centre)[:, None], poses[k][:3, :3]], 1) for k in keys]
+    )
     held = GUESSED * scale_of(poses[keys[0]]) * np.concatenate([-guess[:, None], np.eye(3)], 1)
     weight = np.ones(len(keys))
     for _ in range(20):
         root = np.sqrt(weight)[:, None]
-        a, b = np.concatenate([(rows * root[..., None]).reshape(-1, 4), held]), np.append(there * root, np.zeros(3))
+        a, b = (
+            np.concatenate([(rows * root[..., None]).reshape(-1, 4), held]),
+            np.append(there * root, np.zeros(3)),
+        )
         solved = np.linalg.lstsq(a, b, rcond=None)[0]
         off = np.linalg.norm(rows @ solved - there, axis=1)
         weight = 1 / (1 + np.square(off / max(float(np.median(off)), 1e-9)))
@@ -58,10 +75,11 @@ def scale_about(centre: np.ndarray, poses: dict, true_poses: dict, middle: np.nd
 
 
 def icp(source: np.ndarray, target: np.ndarray, start: np.ndarray, rounds: int = 30) -> np.ndarray:
-    """Similarity (4, 4) that carries points onto points, from `start`; nearest neighbours, the farthest tenth left out."""
+    """Similarity (4, 4) that carries points onto points, from `start`; nearest neighbours, the
+    farthest tenth left out."""
     from scipy.spatial import cKDTree
 
-    from relit.cameras.se3 import umeyama
+    from relit.geometry.se3 import umeyama
 
     tree, frame = cKDTree(target), start
     for _ in range(rounds):

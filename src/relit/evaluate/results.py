@@ -7,14 +7,21 @@ from typing import Any
 import numpy as np
 
 
-def entries(values: dict[str, float], definitions: dict[str, tuple[str, str]]) -> dict[str, dict[str, Any]]:
-    """{name: {"value", "unit", "definition"}} of those figures that are defined, in the order of their definitions (unit, sentence)."""
+def entries(
+    values: dict[str, float], definitions: dict[str, tuple[str, str]]
+) -> dict[str, dict[str, Any]]:
+    """{name: {"value", "unit", "definition"}} of those figures that are defined, in the order of
+    their definitions (unit, sentence)."""
     known = ((name, *definitions[name]) for name in definitions if name in values)
-    return {name: {"value": float(values[name]), "unit": unit, "definition": definition} for name, unit, definition in known}
+    return {
+        name: {"value": float(values[name]), "unit": unit, "definition": definition}
+        for name, unit, definition in known
+    }
 
 
 def means(per_view: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Mean of each per-view figure over views, and over lights where there are several ('name:light')."""
+    """Mean of each per-view figure over views, and over lights where there are several
+    ('name:light')."""
     gathered: dict[str, list[float]] = {}
     for figures in per_view.values():
         for key, value in figures.items():

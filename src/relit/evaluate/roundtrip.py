@@ -1,4 +1,5 @@
-"""What the file formats cost: an asset read back from its folder against pictures of it as the fit held it."""
+"""What the file formats cost: an asset read back from its folder against pictures of it as the fit
+held it."""
 
 from __future__ import annotations
 
@@ -12,12 +13,14 @@ from relit.scene import Asset, Camera
 
 
 def write_own_renders(folder: str | Path, asset: Asset) -> None:
-    """Keep pictures of an asset as the fit holds it, before any file format: `own_0000.exr` (0000 = index of the camera), linear RGBA.
+    """Keep pictures of an asset as the fit holds it, before any file format: `own_0000.exr` (0000 =
+    index of the camera), linear RGBA.
 
-    ROUNDTRIP_VIEWS of its cameras, at most ROUNDTRIP_SIDE pixels a side, under its own light. `glb_roundtrip` compares with them.
+    ROUNDTRIP_VIEWS of its cameras, at most ROUNDTRIP_SIDE pixels a side, under its own light.
+    `glb_roundtrip` compares with them.
     """
     from relit.images import write_linear
-    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.reference.mitsuba_scene import build_scene, render
 
     count = len(asset.cameras)
     if asset.environment is None or count == 0:
@@ -29,10 +32,11 @@ def write_own_renders(folder: str | Path, asset: Asset) -> None:
 
 
 def glb_roundtrip(asset: Asset, folder: str | Path) -> float | None:
-    """Mean PSNR of an asset that was read back from its folder against the pictures of `write_own_renders` in `folder`: the same views,
-    light and random numbers. None where there are no such pictures."""
+    """Mean PSNR of an asset that was read back from its folder against the pictures of
+    `write_own_renders` in `folder`: the same views, light and random numbers. None where there are
+    no such pictures."""
     from relit.images import read_data
-    from relit.rendering.mitsuba_scene import build_scene, render
+    from relit.reference.mitsuba_scene import build_scene, render
 
     files = sorted(Path(folder).glob("own_*.exr"))
     if not files or asset.environment is None:

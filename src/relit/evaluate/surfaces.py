@@ -13,24 +13,34 @@ from relit.scene import Camera, Mesh
 
 
 def visible(mesh: Mesh, world_from_asset, points: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """(N,) bool: whether the segment from a world point (N, 3) on the mesh to some camera's centre is free of the mesh.
+    """(N,) bool: whether the segment from a world point (N, 3) on the mesh to some camera's centre
+    is free of the mesh.
 
     Segments start 1e-4 of the mesh's extent off the point, towards the camera.
     """
     import drjit as dr
     import mitsuba as mi
 
-    from relit.rendering.mitsuba_scene import build_geometry
+    from relit.reference.mitsuba_scene import build_geometry
 
     world = move_points(world_from_asset, mesh.vertices)
     low, high = world.min(0), world.max(0)
-    unit_from_world = similarity(np.eye(3), -(low + high) / np.ptp(world, axis=0).max(), 2 / np.ptp(world, axis=0).max())
+    unit_from_world = similarity(
+        np.eye(3), -(low + high) / np.ptp(world, axis=0).max(), 2 / np.ptp(world, axis=0).max()
+    )
     vertices = move_points(unit_from_world, world).astype(np.float32)
-    scene = build_geometry(Mesh(vertices, mesh.faces, np.zeros_like(vertices)))  # queries look at no shading normal
+    scene = build_geometry(
+        Mesh(vertices, mesh.faces, np.zeros_like(vertices))
+    )  # queries look at no shading normal
     start, gap = move_points(unit_from_world, points).astype(np.float32), 2e-4
-    p, seen = mi.Point3f(*[mi.Float(np.ascontiguousarray(start[:, k])) for k in range(3)]), dr.zeros(mi.Bool, len(start))
+    p, seen = (
+        mi.Point3f(*[mi.Float(np.ascontiguousarray(start[:, k])) for k in range(3)]),
+        dr.zeros(mi.Bool, len(start)),
+    )
     for camera in cameras:
-        centre = mi.Point3f(*[dr.opaque(mi.Float, float(x)) for x in move_points(unit_from_world, camera.centre)])
+        centre = mi.Point3f(
+            *[dr.opaque(mi.Float, float(x)) for x in move_points(unit_from_world, camera.centre)]
+        )
         d = mi.Vector3f(centre - p)
         length = dr.norm(d)
         d /= length
@@ -39,7 +49,9 @@ def visible(mesh: Mesh, world_from_asset, points: np.ndarray, cameras: list[Came
     return seen.numpy().astype(bool)
 
 
-def chamfer_figures(mesh: Mesh, world_from_asset, truth: Truth, count: int = SURFACE_SAMPLES) -> dict[str, float]:
+def chamfer_figures(
+    mesh: Mesh, world_from_asset, truth: Truth, count: int = SURFACE_SAMPLES
+) -> dict[str, float]:
     """The Chamfer figures between the surfaces that cameras can see (`DEFINITIONS['chamfer']`)."""
     import trimesh
 
@@ -51,7 +63,10 @@ def chamfer_figures(mesh: Mesh, world_from_asset, truth: Truth, count: int = SUR
         surface = m.sample_surface(move_points(frame, each.vertices), each.faces, count, seed=i)
         seen = visible(each, frame, surface.points, cameras)
         if not (seen & surface.uniform).any():
-            raise UserError("no part of the mesh can be seen by any camera", "it lies elsewhere than the cameras look, or is empty")
+            raise UserError(
+                "no part of the mesh can be seen by any camera",
+                "it lies elsewhere than the cameras look, or is empty",
+            )
         samples.append(surface.only(seen))
     mean, accuracy, completeness = m.chamfer(*samples)
     return {

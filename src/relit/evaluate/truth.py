@@ -1,4 +1,4 @@
-"""The truth of a synthetic capture: what `relit synthesize` writes (capture/synthetic.py)."""
+"""The truth of a synthetic capture: what `relit synthesize` writes (synthesize/multiview.py)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from relit.scene import Camera
 
 @dataclass(frozen=True)
 class Truth:
-    """A synthetic capture's truth. train, test: cameras by name without folder and extension, in the true world frame.
+    """A synthetic capture's truth. train, test: cameras by name without folder and extension, in
+    the true world frame.
     radius: of the object's bounding sphere, world units. meta: the content of truth.json."""
 
     folder: Path
@@ -33,8 +34,8 @@ class Truth:
 
 
 def truth_kind(folder: str | Path) -> str:
-    """The kind of capture that `relit synthesize` made of the folder, as its truth/settings.json says ('duplicates', 'collection'); ''
-    where that names none."""
+    """The kind of capture that `relit synthesize` made of the folder, as its truth/settings.json
+    says ('duplicates', 'collection'); '' where that names none."""
     try:
         said = json.loads((Path(folder) / "truth" / "settings.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -46,11 +47,16 @@ def truth_kind(folder: str | Path) -> str:
 def has_truth(folder: str | Path) -> bool:
     """Whether `relit synthesize` made the folder, finished or not."""
     folder = Path(folder)
-    return folder.name == "truth" or (folder / "truth" / "settings.json").is_file() or (folder / "truth" / "truth.json").is_file()
+    return (
+        folder.name == "truth"
+        or (folder / "truth" / "settings.json").is_file()
+        or (folder / "truth" / "truth.json").is_file()
+    )
 
 
 def load_truth(folder: str | Path) -> Truth:
-    """Read the cameras and the description of a synthetic capture. Raises UserError where there is none, or an unfinished one."""
+    """Read the cameras and the description of a synthetic capture. Raises UserError where there is
+    none, or an unfinished one."""
     from relit.asset.asset import read_json
 
     folder = Path(folder)
@@ -62,10 +68,16 @@ def load_truth(folder: str | Path) -> Truth:
             if (folder / "truth" / "settings.json").exists()
             else "there is no truth/truth.json"
         )
-        raise UserError("the folder holds no complete truth", why, f"make one with `relit synthesize`, or give its folder: {folder}")
+        raise UserError(
+            "the folder holds no complete truth",
+            why,
+            f"make one with `relit synthesize`, or give its folder: {folder}",
+        )
     meta = read_json(file)
     size = meta["settings"]["resolution"]
-    train, test = (_read_cameras(folder / f"transforms_{split}.json", size) for split in ("train", "test"))
+    train, test = (
+        _read_cameras(folder / f"transforms_{split}.json", size) for split in ("train", "test")
+    )
     return Truth(folder, train, test, float(meta["sphere"]["radius"]), meta)
 
 
@@ -76,7 +88,13 @@ def _read_cameras(file: Path, size: int) -> dict[str, Camera]:
     focal = size / (2 * np.tan(content["camera_angle_x"] / 2))
     return {
         camera_key(f["file_path"]): Camera(
-            size, size, focal, focal, size / 2, size / 2, world_from_cv_camera(np.array(f["transform_matrix"], np.float64))
+            size,
+            size,
+            focal,
+            focal,
+            size / 2,
+            size / 2,
+            world_from_cv_camera(np.array(f["transform_matrix"], np.float64)),
         )
         for f in content["frames"]
     }

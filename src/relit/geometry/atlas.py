@@ -1,4 +1,5 @@
-"""UV atlases: xatlas in a process of its own that can be stopped, and a simple one that always works."""
+"""UV atlases: xatlas in a process of its own that can be stopped, and a simple one that always
+works."""
 
 from __future__ import annotations
 
@@ -32,12 +33,15 @@ np.savez(sys.argv[2], mapping=mapping, faces=faces, uvs=uvs)
 """
 
 
-def unwrap(mesh: Mesh, resolution: int, *, padding: int = 3, seconds: float = 90.0) -> tuple[Mesh, str]:
-    """Give a mesh texture coordinates; vertices are doubled along seams. Returns the mesh and how it was done ('xatlas' or 'cells').
+def unwrap(
+    mesh: Mesh, resolution: int, *, padding: int = 3, seconds: float = 90.0
+) -> tuple[Mesh, str]:
+    """Give a mesh texture coordinates; vertices are doubled along seams. Returns the mesh and how
+    it was done ('xatlas' or 'cells').
 
-    resolution: texels a side that the padding refers to. xatlas can hang or crash on difficult meshes: it runs in a process of its
-    own for at most `seconds` of processor time (BUSY times that by the clock), and a mesh that it does not manage gets an atlas of cells,
-    two faces in each.
+    resolution: texels a side that the padding refers to. xatlas can hang or crash on difficult
+    meshes: it runs in a process of its own for at most `seconds` of processor time (BUSY times that
+    by the clock), and a mesh that it does not manage gets an atlas of cells, two faces in each.
     """
     if len(mesh.faces) <= XATLAS_FACES:
         found = _xatlas(mesh, resolution, padding, seconds)
@@ -62,10 +66,19 @@ def _xatlas(mesh: Mesh, resolution: int, padding: int, seconds: float) -> Mesh |
             command = [sys.executable, "-c", SCRIPT, source, target, str(max(1, round(seconds)))]
             subprocess.run(command, check=True, timeout=BUSY * seconds, capture_output=True)
             with np.load(target, allow_pickle=False) as d:
-                mapping, faces, uvs = d["mapping"].astype(np.int64), d["faces"].astype(np.int32), d["uvs"].astype(np.float32)
+                mapping, faces, uvs = (
+                    d["mapping"].astype(np.int64),
+                    d["faces"].astype(np.int32),
+                    d["uvs"].astype(np.float32),
+                )
         except (subprocess.SubprocessError, OSError, KeyError, ValueError):
             return None
-    if len(faces) != len(mesh.faces) or not np.isfinite(uvs).all() or uvs.min() < -1e-4 or uvs.max() > 1 + 1e-4:
+    if (
+        len(faces) != len(mesh.faces)
+        or not np.isfinite(uvs).all()
+        or uvs.min() < -1e-4
+        or uvs.max() > 1 + 1e-4
+    ):
         return None
     return replace(
         mesh,
@@ -77,7 +90,8 @@ def _xatlas(mesh: Mesh, resolution: int, padding: int, seconds: float) -> Mesh |
 
 
 def cells(mesh: Mesh, resolution: int) -> Mesh:
-    """An atlas of equal square cells with two faces each: no shared texels between faces, no chart shapes to fail on."""
+    """An atlas of equal square cells with two faces each: no shared texels between faces, no chart
+    shapes to fail on."""
     count = len(mesh.faces)
     side = int(np.ceil(np.sqrt((count + 1) // 2)))
     size = 1.0 / side

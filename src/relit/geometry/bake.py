@@ -1,4 +1,5 @@
-"""Between textures and the surface: which texel lies where, and filling the gutters between charts."""
+"""Between textures and the surface: which texel lies where, and filling the gutters between
+charts."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from relit.scene import Mesh
 
 
 def rasterise_atlas(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which face covers the centre of each texel: face (S, S) int32 (-1: none) and barycentric coordinates (S, S, 3) float32."""
+    """Which face covers the centre of each texel: face (S, S) int32 (-1: none) and barycentric
+    coordinates (S, S, 3) float32."""
     face = np.full((size, size), -1, np.int32)
     bary = np.zeros((size, size, 3), np.float32)
     corners = mesh.uvs[mesh.faces].astype(np.float64) * size - 0.5  # texel centres at integers
@@ -27,10 +29,18 @@ def rasterise_atlas(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray]:
             x = low[part, 0, None] + dx.ravel()
             y = low[part, 1, None] + dy.ravel()
             a, b, c = (corners[part, k][:, None] for k in range(3))
-            det = (b[..., 1] - c[..., 1]) * (a[..., 0] - c[..., 0]) + (c[..., 0] - b[..., 0]) * (a[..., 1] - c[..., 1])
+            det = (b[..., 1] - c[..., 1]) * (a[..., 0] - c[..., 0]) + (c[..., 0] - b[..., 0]) * (
+                a[..., 1] - c[..., 1]
+            )
             det = np.where(np.abs(det) < 1e-12, 1e-12, det)
-            l0 = ((b[..., 1] - c[..., 1]) * (x - c[..., 0]) + (c[..., 0] - b[..., 0]) * (y - c[..., 1])) / det
-            l1 = ((c[..., 1] - a[..., 1]) * (x - c[..., 0]) + (a[..., 0] - c[..., 0]) * (y - c[..., 1])) / det
+            l0 = (
+                (b[..., 1] - c[..., 1]) * (x - c[..., 0])
+                + (c[..., 0] - b[..., 0]) * (y - c[..., 1])
+            ) / det
+            l1 = (
+                (c[..., 1] - a[..., 1]) * (x - c[..., 0])
+                + (a[..., 0] - c[..., 0]) * (y - c[..., 1])
+            ) / det
             l2 = 1 - l0 - l1
             inside = (l0 >= -1e-4) & (l1 >= -1e-4) & (l2 >= -1e-4)
             f = np.broadcast_to(part[:, None], inside.shape)
@@ -39,14 +49,17 @@ def rasterise_atlas(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray]:
     return face, bary
 
 
-def interpolate(mesh_values: np.ndarray, faces: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+def interpolate(
+    mesh_values: np.ndarray, faces: np.ndarray, face: np.ndarray, bary: np.ndarray
+) -> np.ndarray:
     """Vertex values (V, C) at covered texels: (S, S, C), 0 where face is -1."""
     out = np.einsum("ijk,ijkc->ijc", bary, mesh_values[faces[np.maximum(face, 0)]])
     return np.where(face[..., None] >= 0, out, 0).astype(np.float32)
 
 
 def fill_gutters(texture: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Give unknown texels the value of the nearest known one, so that filtering across chart borders brings in nothing foreign."""
+    """Give unknown texels the value of the nearest known one, so that filtering across chart
+    borders brings in nothing foreign."""
     if known.all() or not known.any():
         return texture
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)

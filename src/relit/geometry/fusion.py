@@ -11,18 +11,23 @@ from relit.geometry.sdf import node_positions, redistance
 from relit.scene import Camera
 
 
-def fuse_depths(cameras: Iterable[Camera], depths: Iterable[np.ndarray], n: int, *, truncation: float) -> np.ndarray:
+def fuse_depths(
+    cameras: Iterable[Camera], depths: Iterable[np.ndarray], n: int, *, truncation: float
+) -> np.ndarray:
     """Signed distance (n, n, n) float32 over [-1, 1]^3.
 
-    cameras: unit frame. depths: (H, W) distances along the rays, not along the optical axis. A node counts a view when it lies in front of
-    the depth or at most `truncation` behind it; nodes that only ever lie deeper are inside, nodes that no view looks at are outside.
+    cameras: unit frame. depths: (H, W) distances along the rays, not along the optical axis. A node
+    counts a view when it lies in front of the depth or at most `truncation` behind it; nodes that
+    only ever lie deeper are inside, nodes that no view looks at are outside.
     """
     p = node_positions(n).reshape(-1, 3).astype(np.float64)
     total, count, looked = np.zeros(len(p)), np.zeros(len(p)), np.zeros(len(p), bool)
     for camera, depth in zip(cameras, depths, strict=False):
         q = camera.project(p)
         u, v = np.floor(q[:, 0]).astype(np.int64), np.floor(q[:, 1]).astype(np.int64)
-        ok = np.flatnonzero((q[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+        ok = np.flatnonzero(
+            (q[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        )
         looked[ok] = True
         s = depth[v[ok], u[ok]] - np.linalg.norm(p[ok] - camera.centre, axis=1)
         near = s > -truncation

@@ -15,12 +15,14 @@ class NoShape(ValueError):
     """Silhouettes, in the poses given, leave no shape."""
 
 
-def visual_hull(cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, *, tolerance: float = 1 / 30) -> np.ndarray:
+def visual_hull(
+    cameras: Iterable[Camera], masks: Iterable[np.ndarray], n: int, *, tolerance: float = 1 / 30
+) -> np.ndarray:
     """Signed distance (n, n, n) float32 [z, y, x] of the visual hull over [-1, 1]^3.
 
-    cameras: in the unit frame. masks: (H, W) in [0, 1], one per camera. A node belongs to the hull when some camera sees it and
-    at most `tolerance` of the cameras that see it (one in thirty) have background there; so one bad mask
-    does not carve the object away.
+    cameras: in the unit frame. masks: (H, W) in [0, 1], one per camera. A node belongs to the hull
+    when some camera sees it and at most `tolerance` of the cameras that see it (one in thirty) have
+    background there; so one bad mask does not carve the object away.
     """
     p = node_positions(n).reshape(-1, 3)
     seen = np.zeros(len(p), np.int32)
@@ -44,4 +46,6 @@ def distance_of(inside: np.ndarray) -> np.ndarray:
     h = 2.0 / (inside.shape[0] - 1)
     if not inside.any() or inside.all():
         raise NoShape("the occupancy is empty or full")
-    return ((distance_transform_edt(~inside) - distance_transform_edt(inside)) * h).astype(np.float32)
+    return ((distance_transform_edt(~inside) - distance_transform_edt(inside)) * h).astype(
+        np.float32
+    )

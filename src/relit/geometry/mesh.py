@@ -14,13 +14,17 @@ from relit.device import load_pycolmap
 from relit.errors import EXIT_FAILED, UserError
 from relit.scene import Mesh
 
-KEEP = 0.02  # components with less than this share of the largest one's area are dropped as floaters
+KEEP = (
+    0.02  # components with less than this share of the largest one's area are dropped as floaters
+)
 
 
 def extract_mesh(values: np.ndarray, *, faces: int | None = None) -> Mesh:
-    """The zero level set of distances (n, n, n) [z, y, x] over [-1, 1]^3, as a closed mesh in the unit frame.
+    """The zero level set of distances (n, n, n) [z, y, x] over [-1, 1]^3, as a closed mesh in the
+    unit frame.
 
-    faces: decimate to about this many by quadric error, or None. Normals come from the field, so they stay smooth.
+    faces: decimate to about this many by quadric error, or None. Normals come from the field, so
+    they stay smooth.
     Raises UserError (exit code 4) when the field has no surface.
     """
     n = values.shape[0]
@@ -52,11 +56,14 @@ def _without_floaters(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if len(parts) < 2:
         return mesh
     areas = np.array([p.area for p in parts])
-    return trimesh.util.concatenate([p for p, a in zip(parts, areas, strict=False) if a >= KEEP * areas.max()])
+    return trimesh.util.concatenate(
+        [p for p, a in zip(parts, areas, strict=False) if a >= KEEP * areas.max()]
+    )
 
 
 def _decimate(mesh: trimesh.Trimesh, ratio: float) -> trimesh.Trimesh:
-    """Quadric edge collapse (Garland & Heckbert 1997), by pycolmap; degenerate and doubled faces are removed after it."""
+    """Quadric edge collapse (Garland & Heckbert 1997), by pycolmap; degenerate and doubled faces
+    are removed after it."""
     pycolmap = load_pycolmap()
 
     pycolmap.logging.minloglevel = 2
@@ -75,11 +82,18 @@ def _decimate(mesh: trimesh.Trimesh, ratio: float) -> trimesh.Trimesh:
 
 
 def field_gradient(values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """∇S of distances (n, n, n) [z, y, x] at points (N, 3) of the unit frame: central differences, trilinear."""
+    """∇S of distances (n, n, n) [z, y, x] at points (N, 3) of the unit frame: central differences,
+    trilinear."""
     n = values.shape[0]
     h = 2.0 / (n - 1)
     at = ((points[:, ::-1] + 1.0) / h).T
-    return np.stack([map_coordinates(np.gradient(values, h, axis=2 - k), at, order=1, mode="nearest") for k in range(3)], -1)
+    return np.stack(
+        [
+            map_coordinates(np.gradient(values, h, axis=2 - k), at, order=1, mode="nearest")
+            for k in range(3)
+        ],
+        -1,
+    )
 
 
 def field_normals(values: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -28,11 +28,13 @@ class Axis:
 
 
 def revolution_axis(points: np.ndarray, normals: np.ndarray) -> tuple[Axis, float]:
-    """(axis, median distance of the normals from it in radii of the surface, 0 for a body of revolution) of points (N, 3) that lie evenly
-    on a surface, with unit normals (N, 3).
+    """(axis, median distance of the normals from it in radii of the surface, 0 for a body of
+    revolution) of points (N, 3) that lie evenly on a surface, with unit normals (N, 3).
 
-    A line through p along n meets the axis (a, ā) where a · (p × n) + ā · n = 0, Plücker's condition, which is linear: least squares under
-    |a| = 1 is an eigenvector (Pottmann and Wallner 2001, Computational Line Geometry), with less weight for normals that miss it.
+    A line through p along n meets the axis (a, ā) where a · (p × n) + ā · n = 0, Plücker's
+    condition, which is linear: least squares under
+    |a| = 1 is an eigenvector (Pottmann and Wallner 2001, Computational Line Geometry), with less
+    weight for normals that miss it.
     """
     middle = points.mean(0)
     size = np.quantile(np.linalg.norm(points - middle, axis=1), 0.99)

@@ -9,7 +9,10 @@ from scipy.spatial import cKDTree
 
 from relit.conventions import move_points, similarity
 
-NORMALS, LOOKED_AT = 500, 8  # planes that are tried, and of these from how many the nearest points are iterated
+NORMALS, LOOKED_AT = (
+    500,
+    8,
+)  # planes that are tried, and of these from how many the nearest points are iterated
 POINTS = 1500  # of the surface that are mirrored
 TRIMMED = 0.9  # share of the points that count: the others have no partner
 ROUNDS = 25
@@ -25,12 +28,16 @@ class Plane:
     @property
     def mirror(self) -> np.ndarray:
         """(4, 4) the reflection."""
-        return similarity(np.eye(3) - 2 * np.outer(self.normal, self.normal), 2 * self.offset * self.normal)
+        return similarity(
+            np.eye(3) - 2 * np.outer(self.normal, self.normal), 2 * self.offset * self.normal
+        )
 
 
 def symmetry_plane(points: np.ndarray, seed: int = 0) -> tuple[Plane, float]:
-    """(plane, mean distance of the mirrored points from the others, without the farthest tenth) of points (N, 3) that lie evenly on a
-    surface: nearest points are iterated (ICP with a reflection) from the best of planes of all directions through their middle."""
+    """(plane, mean distance of the mirrored points from the others, without the farthest tenth) of
+    points (N, 3) that lie evenly on a
+    surface: nearest points are iterated (ICP with a reflection) from the best of planes of all
+    directions through their middle."""
     rng = np.random.default_rng(seed)
     tree, middle = cKDTree(points), points.mean(0)
     some = points[rng.permutation(len(points))[:POINTS]]

@@ -1,4 +1,5 @@
-"""From a file to an array of codes, or of linear floats: one decoder per format, each refusing what is damaged or too large."""
+"""From a file to an array of codes, or of linear floats: one decoder per format, each refusing what
+is damaged or too large."""
 
 from __future__ import annotations
 
@@ -28,10 +29,15 @@ def checked(path: Path) -> str:
     suffix = path.suffix.lower()
     if not path.is_file():
         raise UserError(
-            "an image file is missing", "it is named by the capture or the command, but is not there", f"check the path: {path}"
+            "an image file is missing",
+            "it is named by the capture or the command, but is not there",
+            f"check the path: {path}",
         )
     if suffix not in EXTENSIONS:
-        raise UserError(f"'{suffix}' is not an image format that can be read", fix=f"use one of {' '.join(sorted(EXTENSIONS))}: {path}")
+        raise UserError(
+            f"'{suffix}' is not an image format that can be read",
+            fix=f"use one of {' '.join(sorted(EXTENSIONS))}: {path}",
+        )
     return suffix
 
 
@@ -45,7 +51,8 @@ def _too_large(path: Path, width: int, height: int) -> None:
 
 
 def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.ndarray, bool]:
-    """-> ((H, W[, C]) uint8, uint16 or float32 array, True when it is linear already). colours: apply the file's colour profile."""
+    """-> ((H, W[, C]) uint8, uint16 or float32 array, True when it is linear already). colours:
+    apply the file's colour profile."""
     suffix = checked(path)
     if suffix == ".exr":
         return _finite(exr(path)[0], path), True
@@ -62,7 +69,9 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
     if suffix in RAW:
         flip = {} if upright else {"user_flip": 0}
         with raw_file(path) as raw:  # camera white balance, no automatic exposure, linear
-            return raw.postprocess(gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, **flip), True
+            return raw.postprocess(
+                gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, **flip
+            ), True
     floats = float_tiff(path)
     if floats is not None:
         return _finite(_float_colours(path, floats.orientation if upright else 1), path), True
@@ -71,12 +80,16 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
             orientation = orientation_of(image) if upright else 1
             if _is_sixteen_bit(path, suffix):
                 array = _sixteen_bit(path, orientation)
-                return (_finite(array, path), True) if array.dtype.kind == "f" else (array, False)  # floats are linear
+                return (
+                    (_finite(array, path), True) if array.dtype.kind == "f" else (array, False)
+                )  # floats are linear
             if image.mode in ("P", "PA") or "transparency" in image.info:
                 image = image.convert("RGBA")
             elif image.mode in ("1", "CMYK", "YCbCr", "HSV", "LAB"):
                 image = image.convert("L" if image.mode == "1" else "RGB")
-            array = turn_upright(np.array(standard_colours(image) if colours else image), orientation)
+            array = turn_upright(
+                np.array(standard_colours(image) if colours else image), orientation
+            )
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
     if array.dtype == np.int32:  # PIL's mode I: 16-bit grey
@@ -85,16 +98,21 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
 
 
 def standard_colours(image: PilImage.Image) -> PilImage.Image:
-    """An 8-bit RGB(A) picture with a colour profile other than sRGB (phones write Display P3) in sRGB codes, clipped to their range."""
+    """An 8-bit RGB(A) picture with a colour profile other than sRGB (phones write Display P3) in
+    sRGB codes, clipped to their range."""
     profile = image.info.get("icc_profile")
     if not profile or image.mode not in ("RGB", "RGBA"):
         return image
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in (source.profile.profile_description or ""):
+        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in (
+            source.profile.profile_description or ""
+        ):
             return image
         intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB", intent)
+        transform = ImageCms.buildTransform(
+            source, ImageCms.createProfile("sRGB"), "RGB", "RGB", intent
+        )
         out = ImageCms.applyTransform(image.convert("RGB"), transform)
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
         return image  # a broken profile is no reason to refuse the photo
@@ -116,7 +134,9 @@ def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
 
     from relit.images.opencv import decode_bytes
 
-    array = decode_bytes(_as_stored(path.read_bytes()), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    array = decode_bytes(
+        _as_stored(path.read_bytes()), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    )
     if array is None or array.dtype.kind not in "uf":
         raise ValueError("the pixels could not be decoded")
     if array.ndim == 3:
@@ -126,7 +146,8 @@ def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FloatTiff:
-    """A TIFF of floating-point colours, which Pillow does not open. width, height: as stored. alpha: has a fourth channel.
+    """A TIFF of floating-point colours, which Pillow does not open. width, height: as stored.
+    alpha: has a fourth channel.
     orientation: EXIF's, 1 to 8."""
 
     width: int
@@ -136,7 +157,8 @@ class FloatTiff:
 
 
 def float_tiff(path: Path) -> FloatTiff | None:
-    """What the head of a TIFF of floating-point colours says; None for all other files (a TIFF of grey floats is Pillow's mode F)."""
+    """What the head of a TIFF of floating-point colours says; None for all other files (a TIFF of
+    grey floats is Pillow's mode F)."""
     if path.suffix.lower() not in (".tif", ".tiff"):
         return None
     try:
@@ -144,8 +166,14 @@ def float_tiff(path: Path) -> FloatTiff | None:
             head = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
             file.seek(head.next)
             head.load(file)
-        channels, kinds = int(head.get(TiffImagePlugin.SAMPLESPERPIXEL, 1)), head.get(TiffImagePlugin.SAMPLEFORMAT, (1,))
-        width, height = int(head[TiffImagePlugin.IMAGEWIDTH]), int(head[TiffImagePlugin.IMAGELENGTH])
+        channels, kinds = (
+            int(head.get(TiffImagePlugin.SAMPLESPERPIXEL, 1)),
+            head.get(TiffImagePlugin.SAMPLEFORMAT, (1,)),
+        )
+        width, height = (
+            int(head[TiffImagePlugin.IMAGEWIDTH]),
+            int(head[TiffImagePlugin.IMAGELENGTH]),
+        )
     except (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error, OverflowError):
         return None  # Pillow says what is wrong with it
     if channels < 3 or kinds[0] != FLOATING:
@@ -167,7 +195,8 @@ def _float_colours(path: Path, orientation: int) -> np.ndarray:
 
 
 def _as_stored(data: bytes) -> bytes:
-    """A file's bytes; of a TIFF with orientation 1: OpenCV, told to ignore it, still mirrors it and refuses what lies on its side."""
+    """A file's bytes; of a TIFF with orientation 1: OpenCV, told to ignore it, still mirrors it and
+    refuses what lies on its side."""
     order = {b"II": "<", b"MM": ">"}.get(data[:2])
     if order is None or struct.unpack(order + "H", data[2:4]) != (42,):
         return data
@@ -180,8 +209,13 @@ def _as_stored(data: bytes) -> bytes:
 
 
 def early_exif(image: PilImage.Image) -> PilImage.Exif:
-    """EXIF by what stands before the pixels: Pillow decodes a whole PNG to look for more. Ask before the pixels are loaded."""
-    known = image.format != "PNG" or image.info.keys() & {"exif", "Raw profile type exif", "XML:com.adobe.xmp"}
+    """EXIF by what stands before the pixels: Pillow decodes a whole PNG to look for more. Ask
+    before the pixels are loaded."""
+    known = image.format != "PNG" or image.info.keys() & {
+        "exif",
+        "Raw profile type exif",
+        "XML:com.adobe.xmp",
+    }
     return image.getexif() if known else PilImage.Exif()
 
 
@@ -192,16 +226,23 @@ def orientation_of(image: PilImage.Image) -> int:
 
 
 def stored_size(image: PilImage.Image) -> tuple[int, int]:
-    """Width and height of the pixels as stored: of a TIFF Pillow tells those that it will have when it is turned."""
+    """Width and height of the pixels as stored: of a TIFF Pillow tells those that it will have when
+    it is turned."""
     tags = getattr(image, "tag_v2", None)
-    return image.size if tags is None else (int(tags[TiffImagePlugin.IMAGEWIDTH]), int(tags[TiffImagePlugin.IMAGELENGTH]))
+    return (
+        image.size
+        if tags is None
+        else (int(tags[TiffImagePlugin.IMAGEWIDTH]), int(tags[TiffImagePlugin.IMAGELENGTH]))
+    )
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
     """Apply EXIF's orientation (1 to 8) to an array (H, W[, C])."""
     if orientation in (5, 6, 7, 8):
         array = array.swapaxes(0, 1)
-    flips = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}.get(orientation, (1, 1))
+    flips = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}.get(
+        orientation, (1, 1)
+    )
     return np.ascontiguousarray(array[:: flips[0], :: flips[1]])
 
 
@@ -219,9 +260,17 @@ def pil(path: Path):
         register_heif_opener()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow warns of large images; the limit here is our own, and an error
+            warnings.simplefilter(
+                "ignore"
+            )  # Pillow warns of large images; the limit here is our own, and an error
             image = PilImage.open(path)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, PilImage.DecompressionBombError) as error:
+    except (
+        UnidentifiedImageError,
+        OSError,
+        SyntaxError,
+        ValueError,
+        PilImage.DecompressionBombError,
+    ) as error:
         raise broken(path, str(error)) from error
     with image:
         _too_large(path, *image.size)
@@ -230,7 +279,8 @@ def pil(path: Path):
 
 @contextmanager
 def raw_file(path: Path):
-    """An open RAW file (rawpy.RawPy). Raises UserError where the package is missing, and for files that it cannot read."""
+    """An open RAW file (rawpy.RawPy). Raises UserError where the package is missing, and for files
+    that it cannot read."""
     package = rawpy()
     try:
         with package.imread(str(path)) as raw:
@@ -238,7 +288,9 @@ def raw_file(path: Path):
             yield raw
     except package.LibRawError as error:
         reason = error.args[0] if error.args else error
-        raise broken(path, reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)) from error
+        raise broken(
+            path, reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
+        ) from error
 
 
 def rawpy():
@@ -278,13 +330,19 @@ def hdr_size(path: Path) -> tuple[int, int]:
         head = f.read(4096)
     for line in head.split(b"\n")[1:]:
         words = line.split()
-        if len(words) == 4 and words[0] in (b"-Y", b"+Y") and words[1].isdigit() and words[3].isdigit():
+        if (
+            len(words) == 4
+            and words[0] in (b"-Y", b"+Y")
+            and words[1].isdigit()
+            and words[3].isdigit()
+        ):
             return int(words[3]), int(words[1])
     raise broken(path, "not a Radiance HDR file")
 
 
 def exr(path: Path, header_only: bool = False):
-    """-> ((H, W, C) float32, shape), or (channel names, shape) for the header. The display window is what is read."""
+    """-> ((H, W, C) float32, shape), or (channel names, shape) for the header. The display window
+    is what is read."""
     import OpenEXR
 
     try:
@@ -292,7 +350,9 @@ def exr(path: Path, header_only: bool = False):
             warnings.simplefilter("ignore")
             with OpenEXR.File(str(path), separate_channels=True, header_only=True) as f:
                 head = f.header()  # emptied when the file is closed
-                windows = [np.asarray(head[k], dtype=np.int64) for k in ("displayWindow", "dataWindow")]
+                windows = [
+                    np.asarray(head[k], dtype=np.int64) for k in ("displayWindow", "dataWindow")
+                ]
                 names = [c.name for c in head["channels"]]
             for window in windows:  # before any pixel is decoded
                 _too_large(path, *(int(v) for v in window[1] - window[0] + 1))
@@ -313,13 +373,17 @@ def exr(path: Path, header_only: bool = False):
     if data.shape[:2] == (h, w) and (dx, dy) == (0, 0):
         return data, (h, w)
     out = np.zeros((h, w, data.shape[2]), np.float32)
-    ys, xs = slice(max(dy, 0), min(dy + data.shape[0], h)), slice(max(dx, 0), min(dx + data.shape[1], w))
+    ys, xs = (
+        slice(max(dy, 0), min(dy + data.shape[0], h)),
+        slice(max(dx, 0), min(dx + data.shape[1], w)),
+    )
     out[ys, xs] = data[ys.start - dy : ys.stop - dy, xs.start - dx : xs.stop - dx]
     return out, (h, w)
 
 
 def _exr_layer(names: list[str]) -> list[str]:
-    """Channels of the picture in a file that may have layers: plain R G B, else the first layer that has them, else a lone channel."""
+    """Channels of the picture in a file that may have layers: plain R G B, else the first layer
+    that has them, else a lone channel."""
     for prefix in dict.fromkeys(["", *(n.rsplit(".", 1)[0] + "." for n in names if "." in n)]):
         if all(prefix + c in names for c in "RGB"):
             return [prefix + c for c in "RGBA" if prefix + c in names]

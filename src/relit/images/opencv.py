@@ -1,4 +1,5 @@
-"""OpenCV's decoders. Of a file that they cannot read they return nothing, or raise, as for a million pixels a side: None here."""
+"""OpenCV's decoders. Of a file that they cannot read they return nothing, or raise, as for a
+million pixels a side: None here."""
 
 from __future__ import annotations
 

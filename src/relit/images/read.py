@@ -32,15 +32,19 @@ from relit.images.decode import (
 )
 from relit.images.write import codes_of
 
-FULL_FRAME_DIAGONAL = 43.2666  # mm, of the 36 x 24 mm film that "35 mm equivalent" focal lengths refer to
+FULL_FRAME_DIAGONAL = (
+    43.2666  # mm, of the 36 x 24 mm film that "35 mm equivalent" focal lengths refer to
+)
 
 
 @dataclass(frozen=True)
 class Image:
     """A decoded picture, turned upright.
 
-    rgb: (H, W, 3) float32 linear Rec.709; composited on black (premultiplied) where the file has an alpha channel.
-    alpha: (H, W) float32 in [0, 1], or None. clipped: (H, W) bool, True where a code value is saturated; None for float formats.
+    rgb: (H, W, 3) float32 linear Rec.709; composited on black (premultiplied) where the file has an
+    alpha channel.
+    alpha: (H, W) float32 in [0, 1], or None. clipped: (H, W) bool, True where a code value is
+    saturated; None for float formats.
     """
 
     rgb: np.ndarray
@@ -52,7 +56,8 @@ class Image:
 class Header:
     """What a file says before it is decoded.
 
-    width, height: pixels, upright. alpha: has an alpha channel. focal: EXIF focal length in pixels, or None.
+    width, height: pixels, upright. alpha: has an alpha channel. focal: EXIF focal length in pixels,
+    or None.
     orientation: EXIF's, 1 to 8; from 5 on the sides of the stored picture are swapped.
     """
 
@@ -68,11 +73,14 @@ class Header:
 
 
 def read_image(path: str | Path, upright: bool = True) -> Image:
-    """Decode a photo to linear float32, EXIF orientation applied once (or not at all with upright=False).
+    """Decode a photo to linear float32, EXIF orientation applied once (or not at all with
+    upright=False).
 
-    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed; 8-bit files with another colour profile are carried to sRGB before), EXR, HDR and
-    TIFF of floats (linear already), HEIC and RAW with the optional extras.
-    Raises UserError for a missing, truncated, oversized or unknown file and for NaN or infinite pixels.
+    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed; 8-bit files with another colour profile are
+    carried to sRGB before), EXR, HDR and TIFF of floats (linear already), HEIC and RAW with the
+    optional extras.
+    Raises UserError for a missing, truncated, oversized or unknown file and for NaN or infinite
+    pixels.
     """
     path = Path(path)
     array, is_linear = decode(path, upright)
@@ -86,7 +94,9 @@ def read_image(path: str | Path, upright: bool = True) -> Image:
         clipped = (array == np.iinfo(array.dtype).max).any(axis=-1)
     array = np.repeat(array, 3, axis=2) if array.shape[2] == 1 else array[..., :3]
     if array.dtype.kind == "u" and not is_linear:
-        rgb = _code_table(array.dtype.str)[array]  # one look-up instead of a dozen arrays of the photo's size
+        rgb = _code_table(array.dtype.str)[
+            array
+        ]  # one look-up instead of a dozen arrays of the photo's size
     else:
         rgb = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
         rgb = rgb if is_linear else linear_from_srgb(rgb)
@@ -96,17 +106,27 @@ def read_image(path: str | Path, upright: bool = True) -> Image:
 
 
 def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image:
-    """A small version of `read_image` (longest side about `side` pixels) for looking at many photos quickly; linear, upright.
+    """A small version of `read_image` (longest side about `side` pixels) for looking at many photos
+    quickly; linear, upright.
 
-    JPEG files are decoded at reduced size. Alpha is kept apart: rgb is NOT composited. `clipped` is None.
+    JPEG files are decoded at reduced size. Alpha is kept apart: rgb is NOT composited. `clipped` is
+    None.
     """
     path = Path(path)
     suffix = checked(path)
     if suffix in FLOAT | RAW or (suffix in (".tif", ".tiff") and _is_float(path)):
         image = read_image(path, upright)
         h, w = image.rgb.shape[:2]
-        size = (max(1, round(w * side / max(w, h))), max(1, round(h * side / max(w, h)))) if max(w, h) > side else (w, h)
-        alpha = None if image.alpha is None else cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA)
+        size = (
+            (max(1, round(w * side / max(w, h))), max(1, round(h * side / max(w, h))))
+            if max(w, h) > side
+            else (w, h)
+        )
+        alpha = (
+            None
+            if image.alpha is None
+            else cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA)
+        )
         return Image(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), alpha)
     with pil(path) as image:
         try:
@@ -117,7 +137,11 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
                 array, _ = decode(path, upright=False, colours=False)
                 image = PilImage.fromarray(codes_of(_unit(array)))
             small = image.convert("RGBA" if has_alpha else "RGB")
-            small = small.reduce(max(1, max(small.size) // side)) if max(small.size) >= 2 * side else small
+            small = (
+                small.reduce(max(1, max(small.size) // side))
+                if max(small.size) >= 2 * side
+                else small
+            )
             array = turn_upright(_unit(np.array(standard_colours(small))), orientation)
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
@@ -133,14 +157,16 @@ def _is_float(path: Path) -> bool:
 
 
 def read_data(path: str | Path) -> np.ndarray:
-    """Decode without a transfer curve: (H, W) or (H, W, C) float32; 8/16-bit codes divided by their largest value. No alpha handling."""
+    """Decode without a transfer curve: (H, W) or (H, W, C) float32; 8/16-bit codes divided by their
+    largest value. No alpha handling."""
     array, _ = decode(Path(path), colours=False)
     array = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
     return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
 
 
 def read_header(path: str | Path) -> Header:
-    """Size, alpha and EXIF focal length without decoding the pixels. Raises UserError as `read_image` does."""
+    """Size, alpha and EXIF focal length without decoding the pixels. Raises UserError as
+    `read_image` does."""
     path = Path(path)
     suffix = checked(path)
     if suffix == ".exr":
@@ -157,7 +183,11 @@ def read_header(path: str | Path) -> Header:
         return Header(w, h, False, _raw_focal(path, w, h), orientation)
     floats = float_tiff(path)
     if floats is not None:
-        w, h = (floats.height, floats.width) if floats.orientation >= 5 else (floats.width, floats.height)
+        w, h = (
+            (floats.height, floats.width)
+            if floats.orientation >= 5
+            else (floats.width, floats.height)
+        )
         return Header(w, h, floats.alpha, None, floats.orientation)
     with pil(path) as image:
         w, h = stored_size(image)
@@ -168,12 +198,16 @@ def read_header(path: str | Path) -> Header:
 
 
 def _focal(exif, width: int, height: int) -> float | None:
-    """Focal length in pixels from EXIF: the 35 mm equivalent (defined on the diagonal), else millimetres and focal-plane resolution."""
+    """Focal length in pixels from EXIF: the 35 mm equivalent (defined on the diagonal), else
+    millimetres and focal-plane resolution."""
     try:
         ifd = exif.get_ifd(0x8769)
         if float(ifd.get(0xA405, 0)) > 0:
             return float(ifd[0xA405]) * float(np.hypot(width, height)) / FULL_FRAME_DIAGONAL
-        resolution, unit = float(ifd.get(0xA20E, 0)), {2: 25.4, 3: 10.0, 4: 1.0}.get(int(ifd.get(0xA210, 2)), 25.4)
+        resolution, unit = (
+            float(ifd.get(0xA20E, 0)),
+            {2: 25.4, 3: 10.0, 4: 1.0}.get(int(ifd.get(0xA210, 2)), 25.4),
+        )
         focal = float(ifd.get(0x920A, 0)) * resolution / unit
         return focal if focal > 0 and np.isfinite(focal) else None
     except (ValueError, TypeError, ZeroDivisionError, KeyError, OSError, SyntaxError):

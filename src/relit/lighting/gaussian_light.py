@@ -1,7 +1,8 @@
-"""An environment of spherical Gaussians that can be optimised: SfD's model of the light (Sec. 3.3, Eq. (2)), beside the map of texels.
+"""An environment of spherical Gaussians that can be optimised: SfD's model of the light (Sec. 3.3,
+Eq. (2)), beside the map of texels.
 
-L(w) = sum_k mu_k exp(lambda_k (w . phi_k - 1)), rendered to a lat-long map that everything else samples; gradients flow through the map to
-phi, log lambda and log mu.
+L(w) = sum_k mu_k exp(lambda_k (w . phi_k - 1)), rendered to a lat-long map that everything else
+samples; gradients flow through the map to phi, log lambda and log mu.
 """
 
 from __future__ import annotations
@@ -15,23 +16,36 @@ from relit.lighting.spherical_gaussians import SHARPEST, SOFTEST, SphericalGauss
 
 FLOATS = 7  # of a lobe: phi, log lambda, log mu
 FLOOR = 1e-5  # radiance under all lobes
-SHARE = 0.5  # a start's lobes overlap so that neighbours fall to about this share of their peak between them
+# a start's lobes overlap so that neighbours fall to about this share of their peak between them
+SHARE = 0.5
 
 
 class GaussianLight:
-    """parameters: Float [count * FLOATS]. rates: Float as wide, how fast each moves against the others."""
+    """parameters: Float [count * FLOATS]. rates: Float as wide, how fast each moves against the
+    others."""
 
     def __init__(self, count: int, rows: int, radiance: float):
-        """An even light of about `radiance` from `count` lobes; `rows` of the map that they are rendered to."""
+        """An even light of about `radiance` from `count` lobes; `rows` of the map that they are
+        rendered to."""
         half_gap = np.sqrt(4 * np.pi / count) / 2
         sharpness = float(np.clip(-np.log(SHARE) / (1 - np.cos(half_gap)), SOFTEST, SHARPEST))
         axes = fibonacci(count)
-        sums = count / (2 * sharpness) * -np.expm1(-2 * sharpness)  # mean over the sphere for lobes of amplitude 1
-        start = np.column_stack([axes, np.full(count, np.log(sharpness)), np.full((count, 3), np.log(max(radiance, 1e-4) / sums))])
+        sums = (
+            count / (2 * sharpness) * -np.expm1(-2 * sharpness)
+        )  # mean over the sphere for lobes of amplitude 1
+        start = np.column_stack(
+            [
+                axes,
+                np.full(count, np.log(sharpness)),
+                np.full((count, 3), np.log(max(radiance, 1e-4) / sums)),
+            ]
+        )
         self.count, self.rows = count, rows
         self.parameters = mi.Float(start.astype(np.float32).ravel())
         self.rates = mi.Float(np.tile(np.array([0.2, 0.2, 0.2, 0.5, 1, 1, 1], np.float32), count))
-        self._directions = mi.Float(environment_directions(rows, 2 * rows).astype(np.float32).ravel())
+        self._directions = mi.Float(
+            environment_directions(rows, 2 * rows).astype(np.float32).ravel()
+        )
 
     def log_radiance(self):
         """Float [rows * 2 rows * 3], differentiable in `parameters`."""

@@ -18,7 +18,8 @@ BORDER = 0.9  # an inverted mask covers at least this share of the photo's borde
 
 
 def find_mask(photo: Path, root: Path, index: dict[str, Path]) -> Path | None:
-    """The mask of a photo: STEM_mask.png or STEM.mask.png beside it, else a file of the same name, stem or number in a mask folder."""
+    """The mask of a photo: STEM_mask.png or STEM.mask.png beside it, else a file of the same name,
+    stem or number in a mask folder."""
     bare = photo.stem.removesuffix("_rgb")  # Synthetic4Relight: 000_rgb.exr, 000_mask.png
     for name in dict.fromkeys((f"{photo.stem}_mask", f"{photo.stem}.mask", f"{bare}_mask")):
         for suffix in (*MASK_SUFFIXES, *map(str.upper, MASK_SUFFIXES)):
@@ -26,7 +27,9 @@ def find_mask(photo: Path, root: Path, index: dict[str, Path]) -> Path | None:
                 return photo.parent / (name + suffix)
     relative = photo.relative_to(root).as_posix() if photo.is_relative_to(root) else photo.name
     without_top = relative.split("/", 1)[-1]
-    exact = [k for r in (relative, without_top) for k in (r + ".png", r, str(Path(r).with_suffix("")))]  # train/000 before 000
+    exact = [
+        k for r in (relative, without_top) for k in (r + ".png", r, str(Path(r).with_suffix("")))
+    ]  # train/000 before 000
     for key in (*exact, photo.name, photo.stem, f"{photo.stem}_mask"):
         if key in index:
             return index[key]
@@ -35,11 +38,16 @@ def find_mask(photo: Path, root: Path, index: dict[str, Path]) -> Path | None:
 
 
 def index_masks(root: Path) -> tuple[Path | None, dict[str, Path]]:
-    """The mask folder of a capture (or None) and its files by relative name, name, stem and number."""
+    """The mask folder of a capture (or None) and its files by relative name, name, stem and
+    number."""
     for base in dict.fromkeys([root, root.parent if root.name in ("images", "image") else root]):
         for name in FOLDERS:
             folder = base / name
-            files = sorted(f for f in folder.rglob("*") if f.suffix.lower() in EXTENSIONS) if folder.is_dir() else []
+            files = (
+                sorted(f for f in folder.rglob("*") if f.suffix.lower() in EXTENSIONS)
+                if folder.is_dir()
+                else []
+            )
             if not files:
                 continue
             index: dict[str, Path] = {}
@@ -65,12 +73,14 @@ def _number(stem: str) -> int | None:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """(H, W) float32 in [0, 1]: the alpha channel where it varies, else the mean of the colour channels; see `read_counted`."""
+    """(H, W) float32 in [0, 1]: the alpha channel where it varies, else the mean of the colour
+    channels; see `read_counted`."""
     return read_counted(path)[0]
 
 
 def read_counted(path: Path) -> tuple[np.ndarray, bool]:
-    """`read_mask`, and whether the file holds the numbers 0 and 1 in the place of black and white: 1 is the object then."""
+    """`read_mask`, and whether the file holds the numbers 0 and 1 in the place of black and white:
+    1 is the object then."""
     data = np.clip(read_data(path), 0.0, 1.0)
     if data.ndim == 3 and data.shape[2] in (2, 4):
         alpha = data[..., -1]
@@ -86,13 +96,17 @@ def read_counted(path: Path) -> tuple[np.ndarray, bool]:
 
 
 def _is_counted(mask: np.ndarray) -> bool:
-    """Whether a decoded picture holds no codes but 0 and 1, of 255 or of 65535, as programs write that number objects."""
+    """Whether a decoded picture holds no codes but 0 and 1, of 255 or of 65535, as programs write
+    that number objects."""
     top = float(mask.max(initial=0.0))
-    return any(abs(top * codes - 1) < 1e-3 for codes in (255, 65535)) and bool(((mask == 0) | (mask == top)).all())
+    return any(abs(top * codes - 1) < 1e-3 for codes in (255, 65535)) and bool(
+        ((mask == 0) | (mask == top)).all()
+    )
 
 
 def _indexed(path: Path) -> bool:
-    """Is it a picture with a palette whose first colour is black? DAVIS and VOC number their objects so."""
+    """Is it a picture with a palette whose first colour is black? DAVIS and VOC number their
+    objects so."""
     if path.suffix.lower() not in CODED:
         return False
     with pil(path) as image:
@@ -100,7 +114,8 @@ def _indexed(path: Path) -> bool:
 
 
 def _of_palette(rgb: np.ndarray) -> np.ndarray:
-    """(H, W) of (H, W, 3): every colour but black is an object, dark red too; grey levels as they are, unless none is bright."""
+    """(H, W) of (H, W, 3): every colour but black is an object, dark red too; grey levels as they
+    are, unless none is bright."""
     soft = rgb.max() > 0.5 and (rgb == rgb[..., :1]).all()
     return rgb[..., 0] if soft else rgb.any(axis=-1).astype(np.float32)
 
@@ -112,7 +127,8 @@ def border_share(mask: np.ndarray) -> float:
 
 
 def looks_inverted(mask: np.ndarray) -> bool:
-    """True when the mask covers the border all around and what it leaves out lies inside, away from the border."""
+    """True when the mask covers the border all around and what it leaves out lies inside, away from
+    the border."""
     if border_share(mask) < BORDER:
         return False
     outside = mask < 0.5
@@ -131,8 +147,9 @@ def looks_inverted(mask: np.ndarray) -> bool:
 def judge(masks: dict[str, np.ndarray], source: str) -> tuple[bool, list[str]]:
     """Look at all masks of a capture (name -> (h, w) small mask).
 
-    Returns whether they are inverted, and the names of photos whose mask is empty. Raises UserError when the masks tell nothing
-    (all black, all white) or contradict each other. source: where they come from, for the message.
+    Returns whether they are inverted, and the names of photos whose mask is empty. Raises UserError
+    when the masks tell nothing (all black, all white) or contradict each other. source: where they
+    come from, for the message.
     """
     empty = [n for n, m in masks.items() if (m > 0.5).mean() < 1e-4]
     full = [n for n, m in masks.items() if (m > 0.5).mean() > 0.999]
@@ -160,6 +177,8 @@ def judge(masks: dict[str, np.ndarray], source: str) -> tuple[bool, list[str]]:
         )
     if len(empty) > 0.5 * len(masks):
         raise UserError(
-            f"{len(empty)} of {len(masks)} masks are black", f"for example that of {empty[0]}", f"write white on the object ({source})"
+            f"{len(empty)} of {len(masks)} masks are black",
+            f"for example that of {empty[0]}",
+            f"write white on the object ({source})",
         )
     return False, empty

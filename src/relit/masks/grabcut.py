@@ -1,4 +1,5 @@
-"""Masks by GrabCut (Rother, Kolmogorov, Blake 2004), seeded by the object sphere, by a box that somebody drew, or by the photo's middle.
+"""Masks by GrabCut (Rother, Kolmogorov, Blake 2004), seeded by the object sphere, by a box that
+somebody drew, or by the photo's middle.
 
 A guess: good before calm backgrounds, poor otherwise.
 """
@@ -29,7 +30,8 @@ def sphere_disc(camera: Camera, sphere: Sphere, scale: float = 1.0) -> np.ndarra
 def grabcut(rgb: np.ndarray, camera: Camera, sphere: Sphere, iterations: int = 4) -> np.ndarray:
     """Linear (H, W, 3) and its pinhole camera -> mask (H, W) float32, 0 or 1.
 
-    Outside the projected sphere is background, its inner half probably object, the ring between probably background.
+    Outside the projected sphere is background, its inner half probably object, the ring between
+    probably background.
     """
     small = work_copy(rgb)
     seen = camera.resized(small.shape[1], small.shape[0])
@@ -40,8 +42,9 @@ def grabcut(rgb: np.ndarray, camera: Camera, sphere: Sphere, iterations: int = 4
 
 
 def centre_cut(rgb: np.ndarray, iterations: int = 5) -> np.ndarray:
-    """Linear (H, W, 3) -> mask (H, W) float32, 0 or 1, of what stands in the middle of a photo of unknown camera: the border is
-    background, the middle probably object. The largest connected part is kept."""
+    """Linear (H, W, 3) -> mask (H, W) float32, 0 or 1, of what stands in the middle of a photo of
+    unknown camera: the border is background, the middle probably object. The largest connected part
+    is kept."""
     small = work_copy(rgb)
     h, w = small.shape[:2]
     labels = np.full((h, w), cv2.GC_PR_BGD, np.uint8)
@@ -53,9 +56,12 @@ def centre_cut(rgb: np.ndarray, iterations: int = 5) -> np.ndarray:
     return enlarged(largest_part(cut(small, labels, iterations)), rgb)
 
 
-def box_cut(rgb: np.ndarray, box: tuple[float, float, float, float], iterations: int = 5) -> np.ndarray:
-    """Linear (H, W, 3) -> mask (H, W) float32, 0 or 1, of the object that a box (x0, y0, x1, y1), pixels, is drawn round: outside is
-    background, inside probably object. The largest connected part is kept; 0 all over where the cut finds nothing."""
+def box_cut(
+    rgb: np.ndarray, box: tuple[float, float, float, float], iterations: int = 5
+) -> np.ndarray:
+    """Linear (H, W, 3) -> mask (H, W) float32, 0 or 1, of the object that a box (x0, y0, x1, y1),
+    pixels, is drawn round: outside is background, inside probably object. The largest connected
+    part is kept; 0 all over where the cut finds nothing."""
     small = work_copy(rgb)
     h, w = small.shape[:2]
     x0, y0, x1, y1 = np.array(box) * np.tile([w / rgb.shape[1], h / rgb.shape[0]], 2)
@@ -70,16 +76,27 @@ def work_copy(rgb: np.ndarray) -> np.ndarray:
     h, w = rgb.shape[:2]
     s = min(1.0, WORK_SIDE / max(h, w))
     size = (max(8, round(w * s)), max(8, round(h * s)))
-    return cv2.resize((np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8), size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        (np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8),
+        size,
+        interpolation=cv2.INTER_AREA,
+    )
 
 
 def cut(small: np.ndarray, labels: np.ndarray, iterations: int) -> np.ndarray:
-    """(h, w) uint8, 1 on the object. labels: OpenCV's seeds (h, w); 0 all over where they hold no object or nothing else."""
+    """(h, w) uint8, 1 on the object. labels: OpenCV's seeds (h, w); 0 all over where they hold no
+    object or nothing else."""
     if not ((labels == cv2.GC_PR_FGD).any() and (labels != cv2.GC_PR_FGD).any()):
         return np.zeros(labels.shape, np.uint8)
     cv2.setRNGSeed(0)  # the colour models start from k-means: same photo, same mask
     cv2.grabCut(
-        np.ascontiguousarray(small[..., ::-1]), labels, None, np.zeros((1, 65)), np.zeros((1, 65)), iterations, cv2.GC_INIT_WITH_MASK
+        np.ascontiguousarray(small[..., ::-1]),
+        labels,
+        None,
+        np.zeros((1, 65)),
+        np.zeros((1, 65)),
+        iterations,
+        cv2.GC_INIT_WITH_MASK,
     )
     return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
 
@@ -87,10 +104,16 @@ def cut(small: np.ndarray, labels: np.ndarray, iterations: int) -> np.ndarray:
 def largest_part(mask: np.ndarray) -> np.ndarray:
     """The largest connected part of a mask (h, w) uint8."""
     _, parts, stats, _ = cv2.connectedComponentsWithStats(mask)
-    return mask if len(stats) < 2 else (parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())).astype(np.uint8)
+    return (
+        mask
+        if len(stats) < 2
+        else (parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())).astype(np.uint8)
+    )
 
 
 def enlarged(mask: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     """The mask at the size of the photo, (H, W) float32, 0 or 1."""
     h, w = rgb.shape[:2]
-    return (cv2.resize(mask.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR) > 0.5).astype(np.float32)
+    return (
+        cv2.resize(mask.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR) > 0.5
+    ).astype(np.float32)

@@ -9,10 +9,14 @@ from relit.errors import EXIT_ENVIRONMENT, UserError
 
 
 def segmenter(model: str = "u2net"):
-    """A function linear (H, W, 3) -> mask (H, W) float32 in [0, 1]. Raises UserError when the extra or its weights are not there."""
+    """A function linear (H, W, 3) -> mask (H, W) float32 in [0, 1]. Raises UserError when the extra
+    or its weights are not there."""
     try:
         import rembg
-    except (ImportError, SystemExit) as error:  # rembg leaves the interpreter when ONNX Runtime is missing
+    except (
+        ImportError,
+        SystemExit,
+    ) as error:  # rembg leaves the interpreter when ONNX Runtime is missing
         raise UserError(
             "masks by segmentation need an optional package",
             "rembg or onnxruntime is not installed",
@@ -31,6 +35,9 @@ def segmenter(model: str = "u2net"):
 
     def mask_of(rgb: np.ndarray) -> np.ndarray:
         codes = (np.clip(srgb_from_linear(rgb), 0, 1) * 255 + 0.5).astype(np.uint8)
-        return np.asarray(rembg.remove(codes, session=session, only_mask=True), dtype=np.float32) / 255.0
+        return (
+            np.asarray(rembg.remove(codes, session=session, only_mask=True), dtype=np.float32)
+            / 255.0
+        )
 
     return mask_of

@@ -15,13 +15,15 @@ DARK = 0.12  # sRGB value below which a backdrop counts as dark
 
 @dataclass(frozen=True)
 class Backdrop:
-    """A plain backdrop. dark: its pixels are nearly black. tolerance: largest difference to it, in sRGB values [0, 1]."""
+    """A plain backdrop. dark: its pixels are nearly black. tolerance: largest difference to it, in
+    sRGB values [0, 1]."""
 
     dark: bool
     tolerance: float
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
-        """Linear (H, W, 3) -> mask (H, W) float32, 0 or 1. The backdrop's colour is taken from the photo's own border."""
+        """Linear (H, W, 3) -> mask (H, W) float32, 0 or 1. The backdrop's colour is taken from the
+        photo's own border."""
         coded = _smoothed(rgb)
         d = _distance(coded, _border_colour(coded))
         return _cleaned(d, self.tolerance)
@@ -30,8 +32,9 @@ class Backdrop:
 def find_backdrop(photos: list[np.ndarray]) -> Backdrop | None:
     """Decide from small linear photos (each (h, w, 3)) whether all stand before a plain backdrop.
 
-    Plain means: in at least 80 % of the photos, 75 % of the border is within .1 of one colour, the same in all photos to .12 (sRGB
-    values), and what differs from it is between 1 % and 85 % of the picture. Returns None otherwise.
+    Plain means: in at least 80 % of the photos, 75 % of the border is within .1 of one colour, the
+    same in all photos to .12 (sRGB values), and what differs from it is between 1 % and 85 % of the
+    picture. Returns None otherwise.
     """
     coded = [_smoothed(p) for p in photos]
     colours = np.array([_border_colour(c) for c in coded])
@@ -40,7 +43,9 @@ def find_backdrop(photos: list[np.ndarray]) -> Backdrop | None:
     for c, colour in zip(coded, colours, strict=True):
         d = _distance(c, colour)
         edge = d[_border(d.shape)]
-        plain.append(float((edge < 0.1).mean()) > 0.75 and float(np.abs(colour - middle).max()) < 0.12)
+        plain.append(
+            float((edge < 0.1).mean()) > 0.75 and float(np.abs(colour - middle).max()) < 0.12
+        )
         borders.append(np.quantile(edge[edge < 0.1], 0.95) if (edge < 0.1).any() else 0.1)
         insides.append(d[d > 0.02])
     if np.mean(plain) < 0.8:
@@ -48,9 +53,15 @@ def find_backdrop(photos: list[np.ndarray]) -> Backdrop | None:
     values = np.concatenate(insides)
     if len(values) < 16:
         return None
-    # near the backdrop's noise rather than half way to the object: shadowed parts of an object before a dark backdrop are dark as well
-    tolerance = float(np.clip(0.37 * _otsu(values), max(0.05, 1.2 * float(np.median(borders))), 0.15))
-    shares = [float((_cleaned(_distance(c, k), tolerance) > 0.5).mean()) for c, k in zip(coded, colours, strict=True)]
+    # near the backdrop's noise rather than half way to the object: shadowed parts of an object
+    # before a dark backdrop are dark as well
+    tolerance = float(
+        np.clip(0.37 * _otsu(values), max(0.05, 1.2 * float(np.median(borders))), 0.15)
+    )
+    shares = [
+        float((_cleaned(_distance(c, k), tolerance) > 0.5).mean())
+        for c, k in zip(coded, colours, strict=True)
+    ]
     if np.mean([0.01 < s < 0.85 for s in shares]) < 0.8:
         return None
     return Backdrop(bool(middle.max() < DARK), tolerance)
@@ -58,7 +69,9 @@ def find_backdrop(photos: list[np.ndarray]) -> Backdrop | None:
 
 def _smoothed(rgb: np.ndarray) -> np.ndarray:
     """sRGB values of a linear photo, blurred a little against noise."""
-    return cv2.GaussianBlur(np.minimum(srgb_from_linear(rgb), 1.0), (0, 0), max(0.6, min(rgb.shape[:2]) / 600))
+    return cv2.GaussianBlur(
+        np.minimum(srgb_from_linear(rgb), 1.0), (0, 0), max(0.6, min(rgb.shape[:2]) / 600)
+    )
 
 
 def _border(shape: tuple[int, ...]) -> np.ndarray:
@@ -77,7 +90,8 @@ def _distance(coded: np.ndarray, colour: np.ndarray) -> np.ndarray:
 
 
 def _otsu(values: np.ndarray) -> float:
-    """Otsu 1979: the threshold that splits values in [0, 1] into two classes with the largest variance between them."""
+    """Otsu 1979: the threshold that splits values in [0, 1] into two classes with the largest
+    variance between them."""
     counts, edges = np.histogram(values, bins=128, range=(0, 1))
     centres = (edges[:-1] + edges[1:]) / 2
     below, total = np.cumsum(counts), counts.sum()
@@ -88,13 +102,16 @@ def _otsu(values: np.ndarray) -> float:
 
 
 def _cleaned(distance: np.ndarray, tolerance: float) -> np.ndarray:
-    """Threshold, close gaps, drop specks, fill small holes: shadows inside the object, not the opening of a handle."""
+    """Threshold, close gaps, drop specks, fill small holes: shadows inside the object, not the
+    opening of a handle."""
     h, w = distance.shape
     mask = (distance > tolerance).astype(np.uint8)
     size = max(3, round(min(h, w) / 60)) | 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
+    mask = cv2.morphologyEx(
+        mask, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+    )
     n, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if n <= 1:
         return mask.astype(np.float32)

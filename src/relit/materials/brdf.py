@@ -1,11 +1,15 @@
-"""The metallic-roughness BRDF, as glTF 2.0 and the SfD and SAMURAI papers use it, for Dr.Jit arrays.
+"""The metallic-roughness BRDF, as glTF 2.0 and the SfD and SAMURAI papers use it, for Dr.Jit
+arrays.
 
-f = (1 - metallic) * ((1 - F_d) * base / pi + F_d-weighted GGX) + metallic * GGX with F0 = base, written as one GGX lobe
-with F0 = lerp(f0, base, metallic) and a Lambertian base under it. Departs from a plain glTF reference in two ways, both
-measured: the lobe is compensated for multiple scattering (Turquin 2019: a white furnace gives .99 on rough metal instead
-of .5), and the viewer's cosine is clamped instead of returning black where an interpolated normal looks away from the viewer.
+f = (1 - metallic) * ((1 - F_d) * base / pi + F_d-weighted GGX) + metallic * GGX with F0 = base,
+written as one GGX lobe with F0 = lerp(f0, base, metallic) and a Lambertian base under it. Departs
+from a plain glTF reference in two ways, both
+measured: the lobe is compensated for multiple scattering (Turquin 2019: a white furnace gives .99
+on rough metal instead of .5), and the viewer's cosine is clamped instead of returning black where
+an interpolated normal looks away from the viewer.
 
-Directions point away from the surface: `v` to the viewer, `l` to the light, `n` the shading normal. All unit.
+Directions point away from the surface: `v` to the viewer, `l` to the light, `n` the shading normal.
+All unit.
 """
 
 from __future__ import annotations
@@ -25,8 +29,8 @@ TABLE = 32
 
 @dataclass
 class Surface:
-    """Material at shading points. base: Color3f in [0, 1], roughness and metallic: Float in [0, 1], f0: dielectric reflectance
-    at normal incidence (Float, .04 for ior 1.5)."""
+    """Material at shading points. base: Color3f in [0, 1], roughness and metallic: Float in [0, 1],
+    f0: dielectric reflectance at normal incidence (Float, .04 for ior 1.5)."""
 
     base: Any
     roughness: Any
@@ -66,8 +70,9 @@ def schlick(f0, v_dot_h):
 
 @lru_cache(maxsize=1)
 def albedo_table() -> np.ndarray:
-    """Directional albedo E(n.v, roughness) of the lobe with F = 1, (TABLE, TABLE) float32, rows roughness from 0 to 1, columns n.v
-    at the centres of equal cells; VNDF-sampled: E = mean of G2 / G1(v) over 64 x 64 stratified samples."""
+    """Directional albedo E(n.v, roughness) of the lobe with F = 1, (TABLE, TABLE) float32, rows
+    roughness from 0 to 1, columns n.v at the centres of equal cells; VNDF-sampled: E = mean of G2 /
+    G1(v) over 64 x 64 stratified samples."""
     c = (np.arange(TABLE) + 0.5) / TABLE
     u = (np.arange(64) + 0.5) / 64
     u1, u2 = (x.ravel()[None] for x in np.meshgrid(u, u))
@@ -78,7 +83,10 @@ def albedo_table() -> np.ndarray:
         a = max(rough**2, MIN_ALPHA)
         vh = v * [a, a, 1]
         vh /= np.linalg.norm(vh, axis=-1, keepdims=True)
-        phi, z = 2 * np.pi * u1, (1 - u2) * (1 + vh[..., 2]) - vh[..., 2]  # Dupuy & Benyoub 2023: spherical caps
+        phi, z = (
+            2 * np.pi * u1,
+            (1 - u2) * (1 + vh[..., 2]) - vh[..., 2],
+        )  # Dupuy & Benyoub 2023: spherical caps
         s = np.sqrt(np.clip(1 - z**2, 0, 1))
         h = np.stack([s * np.cos(phi), s * np.sin(phi), z], -1) + vh
         h = h * [a, a, 1]
@@ -94,7 +102,10 @@ def lobe_albedo(n_dot_v, roughness):
     """Bilinear look-up of `albedo_table`; differentiable in both arguments."""
     table = mi.Float(albedo_table().ravel())
     x, y = dr.clip(n_dot_v * TABLE - 0.5, 0, TABLE - 1), dr.clip(roughness, 0, 1) * (TABLE - 1)
-    x0, y0 = dr.minimum(mi.UInt32(dr.detach(x)), TABLE - 2), dr.minimum(mi.UInt32(dr.detach(y)), TABLE - 2)
+    x0, y0 = (
+        dr.minimum(mi.UInt32(dr.detach(x)), TABLE - 2),
+        dr.minimum(mi.UInt32(dr.detach(y)), TABLE - 2),
+    )
     fx, fy = x - mi.Float(x0), y - mi.Float(y0)
     i = y0 * TABLE + x0
     g = lambda k: dr.gather(mi.Float, table, i + k)  # noqa: E731
@@ -125,14 +136,16 @@ def specular_share(m: Surface, n, v):
 
 
 def _seen(n, v):
-    """`v` in the frame of `n`, lifted to MIN_COS where an interpolated normal looks away from the viewer."""
+    """`v` in the frame of `n`, lifted to MIN_COS where an interpolated normal looks away from the
+    viewer."""
     wo = mi.Frame3f(n).to_local(v)
     wo.z = dr.maximum(wo.z, MIN_COS)
     return dr.normalize(wo)
 
 
 def sample(m: Surface, n, v, u_lobe, u2):
-    """Direction l drawn from `pdf`; u_lobe: Float, u2: Point2f, uniform in [0, 1). May fall below the horizon (pdf 0)."""
+    """Direction l drawn from `pdf`; u_lobe: Float, u2: Point2f, uniform in [0, 1). May fall below
+    the horizon (pdf 0)."""
     with dr.suspend_grad():
         frame = mi.Frame3f(n)
         wo = _seen(n, v)
@@ -155,7 +168,9 @@ def pdf(m: Surface, n, v, l):
         h = dr.normalize(mi.Frame3f(n).to_world(wo) + l)
         a = m.alpha
         a2 = dr.square(a)
-        g1_over_4nv = 0.5 / (n_dot_v + dr.sqrt(dr.fma(dr.square(n_dot_v), 1 - a2, a2)))  # G1(v) / (4 n.v) * 1 / (v.h) * (v.h)
+        g1_over_4nv = 0.5 / (
+            n_dot_v + dr.sqrt(dr.fma(dr.square(n_dot_v), 1 - a2, a2))
+        )  # G1(v) / (4 n.v) * 1 / (v.h) * (v.h)
         p_spec = ggx_d(dr.clip(dr.dot(n, h), 0, 1), a) * g1_over_4nv
         w = specular_share(m, n, v)
         return dr.select(n_dot_l > 0, w * p_spec + (1 - w) * n_dot_l * dr.inv_pi, 0)

@@ -17,7 +17,8 @@ MAX_SLOPE = 1.0  # of a normal map: 45 degrees along each axis
 
 @dataclass
 class MaterialField:
-    """Square textures of `size` texels a side. colour: Float [size^2 * 4], linear base colour and roughness. metallic: Float [size^2].
+    """Square textures of `size` texels a side. colour: Float [size^2 * 4], linear base colour and
+    roughness. metallic: Float [size^2].
     slope: Float [size^2 * 2], the normal map as x / z and y / z of tangent-space normals."""
 
     size: int
@@ -27,11 +28,22 @@ class MaterialField:
     f0: float = 0.04
 
 
-def start_material(size: int, base: np.ndarray, roughness, metallic, f0: float = 0.04) -> MaterialField:
-    """base: (size, size, 3) linear start of the base colour. roughness, metallic: a number or (size, size)."""
-    rough, metal = (np.broadcast_to(np.asarray(a, np.float32), (size, size)) for a in (roughness, metallic))
+def start_material(
+    size: int, base: np.ndarray, roughness, metallic, f0: float = 0.04
+) -> MaterialField:
+    """base: (size, size, 3) linear start of the base colour. roughness, metallic: a number or
+    (size, size)."""
+    rough, metal = (
+        np.broadcast_to(np.asarray(a, np.float32), (size, size)) for a in (roughness, metallic)
+    )
     colour = np.concatenate([base, rough[..., None]], -1).astype(np.float32)
-    return MaterialField(size, mi.Float(colour.ravel()), mi.Float(metal.ravel()), dr.zeros(mi.Float, size * size * 2), f0)
+    return MaterialField(
+        size,
+        mi.Float(colour.ravel()),
+        mi.Float(metal.ravel()),
+        dr.zeros(mi.Float, size * size * 2),
+        f0,
+    )
 
 
 def texels_at(field: MaterialField, uv):
@@ -41,7 +53,12 @@ def texels_at(field: MaterialField, uv):
     x0, y0 = mi.UInt32(x), mi.UInt32(y)
     fx, fy = x - mi.Float(x0), y - mi.Float(y0)
     i = y0 * s + x0
-    return [(i, (1 - fx) * (1 - fy)), (i + 1, fx * (1 - fy)), (i + s, (1 - fx) * fy), (i + s + 1, fx * fy)]
+    return [
+        (i, (1 - fx) * (1 - fy)),
+        (i + 1, fx * (1 - fy)),
+        (i + s, (1 - fx) * fy),
+        (i + s + 1, fx * fy),
+    ]
 
 
 def nearest_texel(field: MaterialField, uv):
@@ -69,7 +86,8 @@ def slope_at(field: MaterialField, uv, active=True):
 
 
 def project(field: MaterialField) -> None:
-    """Clip every texel to what a material may be: colour and metallic in [0, 1], roughness in [MIN_ROUGHNESS, 1]."""
+    """Clip every texel to what a material may be: colour and metallic in [0, 1], roughness in
+    [MIN_ROUGHNESS, 1]."""
     n = dr.width(field.colour)
     low = dr.select(dr.arange(mi.UInt32, n) % 4 == 3, mi.Float(MIN_ROUGHNESS), mi.Float(0.0))
     field.colour = dr.clip(field.colour, low, 1)
@@ -88,4 +106,8 @@ def normal_map(field: MaterialField) -> np.ndarray:
 def pictures(field: MaterialField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Base colour (S, S, 3), roughness (S, S), metallic (S, S), float32."""
     c = np.array(field.colour).reshape(field.size, field.size, 4)
-    return c[..., :3].copy(), c[..., 3].copy(), np.array(field.metallic).reshape(field.size, field.size)
+    return (
+        c[..., :3].copy(),
+        c[..., 3].copy(),
+        np.array(field.metallic).reshape(field.size, field.size),
+    )

@@ -1,4 +1,5 @@
-"""A first guess of the base colour: what is left of the radiance once shading that depends smoothly on the normal is taken out."""
+"""A first guess of the base colour: what is left of the radiance once shading that depends smoothly
+on the normal is taken out."""
 
 from __future__ import annotations
 
@@ -6,17 +7,24 @@ import numpy as np
 
 
 def harmonics(n: np.ndarray) -> np.ndarray:
-    """The nine real spherical harmonics up to order 2, not normalised, at unit vectors (N, 3) -> (N, 9)."""
+    """The nine real spherical harmonics up to order 2, not normalised, at unit vectors (N, 3) ->
+    (N, 9)."""
     x, y, z = n.T
-    return np.stack([np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1)
+    return np.stack(
+        [np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1
+    )
 
 
-def base_without_shading(radiance: np.ndarray, normals: np.ndarray, weights: np.ndarray, *, iterations: int = 25) -> np.ndarray:
-    """Relative base colour (N, 3) > 0, mean luminance 1, of surface points with `radiance` (N, 3), unit `normals` and areas `weights`.
+def base_without_shading(
+    radiance: np.ndarray, normals: np.ndarray, weights: np.ndarray, *, iterations: int = 25
+) -> np.ndarray:
+    """Relative base colour (N, 3) > 0, mean luminance 1, of surface points with `radiance` (N, 3),
+    unit `normals` and areas `weights`.
 
-    Diffuse shading is a function of the normal that nine harmonics describe (Ramamoorthi & Hanrahan 2001); base colour is piecewise
-    constant. So log radiance = harmonics(n) c + log base with few large residuals: least absolute deviations, by reweighting, one
-    shading for all channels but its constant (coloured light is left to the fit).
+    Diffuse shading is a function of the normal that nine harmonics describe (Ramamoorthi & Hanrahan
+    2001); base colour is piecewise constant. So log radiance = harmonics(n) c + log base with few
+    large residuals: least absolute deviations, by reweighting, one shading for all channels but its
+    constant (coloured light is left to the fit).
     """
     logs = np.log(np.maximum(radiance, 1e-3))
     y = harmonics(normals)

@@ -1,4 +1,5 @@
-"""Textures of a rough plastic as flat Dr.Jit arrays: look-up with gradients, and the way back to pictures."""
+"""Textures of a rough plastic as flat Dr.Jit arrays: look-up with gradients, and the way back to
+pictures."""
 
 from __future__ import annotations
 
@@ -17,8 +18,9 @@ LEAST_ALPHA, MOST_SPECULAR = 0.03, 2.0
 
 @dataclass
 class PlasticField:
-    """Square textures of `size` texels a side. diffuse: Float [size^2 * 4], diffuse albedo and nothing. lobe: Float [size^2 * 2], specular
-    albedo and alpha. slope: Float [size^2 * 2], the normal map as x / z and y / z of tangent-space normals."""
+    """Square textures of `size` texels a side. diffuse: Float [size^2 * 4], diffuse albedo and
+    nothing. lobe: Float [size^2 * 2], specular albedo and alpha. slope: Float [size^2 * 2], the
+    normal map as x / z and y / z of tangent-space normals."""
 
     size: int
     diffuse: Any
@@ -31,7 +33,9 @@ def start_plastic(diffuse: np.ndarray, specular: np.ndarray, alpha: np.ndarray) 
     s = diffuse.shape[0]
     flat = lambda *parts: mi.Float(np.concatenate(parts, -1).astype(np.float32).ravel())  # noqa: E731
     zero = np.zeros((s, s, 1))
-    return PlasticField(s, flat(diffuse, zero), flat(specular[..., None], alpha[..., None]), flat(zero, zero))
+    return PlasticField(
+        s, flat(diffuse, zero), flat(specular[..., None], alpha[..., None]), flat(zero, zero)
+    )
 
 
 def plastic_at(field: PlasticField, uv, active=True):
@@ -48,7 +52,10 @@ def project(field: PlasticField) -> None:
     """Clip every texel to what a material may be."""
     field.diffuse = dr.clip(field.diffuse, 0, 1)
     second = dr.arange(mi.UInt32, dr.width(field.lobe)) % 2 == 1
-    low, high = dr.select(second, mi.Float(LEAST_ALPHA), mi.Float(0.0)), dr.select(second, mi.Float(1.0), mi.Float(MOST_SPECULAR))
+    low, high = (
+        dr.select(second, mi.Float(LEAST_ALPHA), mi.Float(0.0)),
+        dr.select(second, mi.Float(1.0), mi.Float(MOST_SPECULAR)),
+    )
     field.lobe = dr.clip(field.lobe, low, high)
     field.slope = dr.clip(field.slope, -MAX_SLOPE, MAX_SLOPE)
     dr.schedule(field.diffuse, field.lobe, field.slope)
@@ -61,4 +68,9 @@ def plastic_pictures(field: PlasticField) -> dict[str, np.ndarray]:
     n = np.concatenate([slope, np.ones_like(slope[..., :1])], -1)
     diffuse = np.array(field.diffuse).reshape(s, s, 4)[..., :3].copy()
     normal = n / np.linalg.norm(n, axis=-1, keepdims=True)
-    return {"diffuse": diffuse, "specular": lobe[..., 0].copy(), "alpha": lobe[..., 1].copy(), "normal": normal}
+    return {
+        "diffuse": diffuse,
+        "specular": lobe[..., 0].copy(),
+        "alpha": lobe[..., 1].copy(),
+        "normal": normal,
+    }

@@ -1,13 +1,17 @@
-"""The rough plastic of PIR: a GGX dielectric coat over a diffuse base, as Mitsuba's `roughplastic` (nonlinear = False) computes it.
+"""The rough plastic of PIR: a GGX dielectric coat over a diffuse base, as Mitsuba's `roughplastic`
+(nonlinear = False) computes it.
 
     f cos θ_l = k_s F D G / (4 cos θ_v)  +  k_d / (1 - R_int) / π  T(θ_v) T(θ_l) / η²  cos θ_l
 
-with the true dielectric Fresnel term F, Smith's separable G (Walter et al. 2007), and k_s, k_d the specular and the diffuse albedo.
-T(θ) = the share of light that enters the coat from outside, R_int = the mean share that it throws back from inside: both depend on alpha,
-are integrated here (`transmittance_tables`) and interpolated, so that roughness receives its gradient through them. PIR's released code
-divides the specular part by the light's cosine and multiplies the diffuse one by the viewer's; here they stand in their right places.
+with the true dielectric Fresnel term F, Smith's separable G (Walter et al. 2007), and k_s, k_d the
+specular and the diffuse albedo. T(θ) = the share of light that enters the coat from outside, R_int
+= the mean share that it throws back from inside: both depend on alpha, are integrated here
+(`transmittance_tables`) and interpolated, so that roughness receives its gradient through them.
+PIR's released code divides the specular part by the light's cosine and multiplies the diffuse one
+by the viewer's; here they stand in their right places.
 
-Directions point away from the surface: `v` to the viewer, `l` to the light, `n` the shading normal. All unit.
+Directions point away from the surface: `v` to the viewer, `l` to the light, `n` the shading normal.
+All unit.
 """
 
 from __future__ import annotations
@@ -23,13 +27,19 @@ import numpy as np
 IOR = 1.49  # polypropylene, PIR Sec. 3.2
 MIN_ALPHA = 0.02
 MIN_COS = 0.02  # clamp of the viewer's cosine at the rims of a mesh
-LOBE_SHARE = 0.5  # of the directions that are drawn from the lobe: what inter-reflection is about (PIR Sec. 3.4) is in it
-COSINES, WIDTHS = 64, 33  # of the tables: cos θ evenly from 0 to 1, sqrt(alpha) evenly from sqrt(MIN_ALPHA) to 1
+# of the directions that are drawn from the lobe: what inter-reflection is about (PIR Sec. 3.4) is
+# in it
+LOBE_SHARE = 0.5
+COSINES, WIDTHS = (
+    64,
+    33,
+)  # of the tables: cos θ evenly from 0 to 1, sqrt(alpha) evenly from sqrt(MIN_ALPHA) to 1
 
 
 @dataclass
 class Plastic:
-    """Material at shading points. diffuse: Color3f, specular: Float (a grey factor on the coat), alpha: Float, width of the GGX lobe."""
+    """Material at shading points. diffuse: Color3f, specular: Float (a grey factor on the coat),
+    alpha: Float, width of the GGX lobe."""
 
     diffuse: Any
     specular: Any
@@ -37,7 +47,8 @@ class Plastic:
 
 
 def fresnel(cos, ior: float = IOR):
-    """Reflectance of an interface between air and a dielectric, unpolarised, for light from the air; cos >= 0 (Float)."""
+    """Reflectance of an interface between air and a dielectric, unpolarised, for light from the
+    air; cos >= 0 (Float)."""
     t = dr.sqrt(1 - (1 - dr.square(cos)) / ior**2)
     s, p = (cos - ior * t) / (cos + ior * t), (ior * cos - t) / (ior * cos + t)
     return 0.5 * (dr.square(s) + dr.square(p))
@@ -52,9 +63,11 @@ def _fresnel_numpy(cos: np.ndarray, eta: float) -> np.ndarray:
 
 
 def crossing(mu: np.ndarray, alpha: float, eta: float, nodes: int, through: bool) -> np.ndarray:
-    """Share of light (N,) that the GGX interface reflects, or lets through, from directions with cosines mu (N,).
+    """Share of light (N,) that the GGX interface reflects, or lets through, from directions with
+    cosines mu (N,).
 
-    Gauss-Legendre over the square that visible normals are drawn from: the mean of F G1(l) or (1 - F) G1(t). What bounces twice is lost.
+    Gauss-Legendre over the square that visible normals are drawn from: the mean of F G1(l) or (1 -
+    F) G1(t). What bounces twice is lost.
 
     eta: index of the far side over that of the near side.
     """
@@ -64,7 +77,10 @@ def crossing(mu: np.ndarray, alpha: float, eta: float, nodes: int, through: bool
     v = np.stack([np.sqrt(1 - mu**2), 0 * mu, mu], -1)[:, None]  # (N, 1, 3)
     vh = v * [alpha, alpha, 1]
     vh /= np.linalg.norm(vh, axis=-1, keepdims=True)
-    phi, z = np.pi * u1, (1 - u2) * (1 + vh[..., 2]) - vh[..., 2]  # half the azimuths: the other half mirrors them
+    phi, z = (
+        np.pi * u1,
+        (1 - u2) * (1 + vh[..., 2]) - vh[..., 2],
+    )  # half the azimuths: the other half mirrors them
     s = np.sqrt(np.clip(1 - z**2, 0, 1))
     h = (np.stack([s * np.cos(phi), s * np.sin(phi), z], -1) + vh) * [alpha, alpha, 1]
     h /= np.linalg.norm(h, axis=-1, keepdims=True)
@@ -72,7 +88,9 @@ def crossing(mu: np.ndarray, alpha: float, eta: float, nodes: int, through: bool
     share = _fresnel_numpy(vdoth, eta)
     if through:
         cos_t = np.sqrt(np.maximum(1 - (1 - vdoth**2) / eta**2, 0))
-        leaves = (cos_t - vdoth / eta) * h[..., 2] + v[..., 2] / eta  # -t·n of Snell's direction t = (v·h / eta - cos_t) h - v / eta
+        leaves = (cos_t - vdoth / eta) * h[..., 2] + v[
+            ..., 2
+        ] / eta  # -t·n of Snell's direction t = (v·h / eta - cos_t) h - v / eta
         share = 1 - share
     else:
         leaves = 2 * vdoth * h[..., 2] - v[..., 2]
@@ -85,7 +103,8 @@ def crossing(mu: np.ndarray, alpha: float, eta: float, nodes: int, through: bool
 def transmittance_tables(ior: float = IOR) -> tuple[np.ndarray, np.ndarray]:
     """T (WIDTHS, COSINES) float32 and R_int (WIDTHS,) float32: see the module's text.
 
-    R_int is the plain mean over the table's cosines, end points at full weight, as Mitsuba takes it: 1.6 % below the integral.
+    R_int is the plain mean over the table's cosines, end points at full weight, as Mitsuba takes
+    it: 1.6 % below the integral.
     """
     mu = np.maximum(np.arange(COSINES) / (COSINES - 1), 1e-6)
     t, r = np.zeros((WIDTHS, COSINES), np.float32), np.zeros(WIDTHS, np.float32)
@@ -96,8 +115,8 @@ def transmittance_tables(ior: float = IOR) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Coat:
-    """The tables of one index of refraction on the device. A plain class: Dr.Jit would carry the fields of a dataclass through its
-    loops as variables."""
+    """The tables of one index of refraction on the device. A plain class: Dr.Jit would carry the
+    fields of a dataclass through its loops as variables."""
 
     def __init__(self, ior: float = IOR):
         t, r = transmittance_tables(float(ior))
@@ -128,7 +147,11 @@ class Coat:
     def internal(self, alpha):
         """R_int(alpha), linear; differentiable."""
         row, fy = self._row(alpha)
-        return dr.lerp(dr.gather(mi.Float, self.internals, row), dr.gather(mi.Float, self.internals, row + 1), fy)
+        return dr.lerp(
+            dr.gather(mi.Float, self.internals, row),
+            dr.gather(mi.Float, self.internals, row + 1),
+            fy,
+        )
 
 
 def ggx_d(n_dot_h, alpha):
@@ -144,9 +167,18 @@ def smith_g1(cos, alpha):
 
 
 def base_radiance(diffuse, coat: Coat, cos_v, alpha, entered):
-    """Radiance of the diffuse base through the coat, Color3f. entered: Color3f or Float, irradiance that came through the coat.
+    """Radiance of the diffuse base through the coat, Color3f. entered: Color3f or Float, irradiance
+    that came through the coat.
     cos_v: Float, of the viewer's direction."""
-    return diffuse * entered * (coat.transmittance(cos_v, alpha) / (1 - coat.internal(alpha)) * (dr.inv_pi / coat.ior**2))
+    return (
+        diffuse
+        * entered
+        * (
+            coat.transmittance(cos_v, alpha)
+            / (1 - coat.internal(alpha))
+            * (dr.inv_pi / coat.ior**2)
+        )
+    )
 
 
 def evaluate(m: Plastic, coat: Coat, n, v, l):
@@ -157,13 +189,22 @@ def evaluate(m: Plastic, coat: Coat, n, v, l):
     alpha = dr.maximum(m.alpha, MIN_ALPHA)
     h = dr.normalize(v + l)
     n_dot_h, v_dot_h = dr.clip(dr.dot(n, h), 0, 1), dr.clip(dr.dot(v, h), 0, 1)
-    lobe = fresnel(v_dot_h, coat.ior) * ggx_d(n_dot_h, alpha) * smith_g1(n_dot_l, alpha) * smith_g1(n_dot_v, alpha) / (4 * n_dot_v)
-    base = base_radiance(m.diffuse, coat, n_dot_v, alpha, coat.transmittance(n_dot_l, alpha) * n_dot_l)
+    lobe = (
+        fresnel(v_dot_h, coat.ior)
+        * ggx_d(n_dot_h, alpha)
+        * smith_g1(n_dot_l, alpha)
+        * smith_g1(n_dot_v, alpha)
+        / (4 * n_dot_v)
+    )
+    base = base_radiance(
+        m.diffuse, coat, n_dot_v, alpha, coat.transmittance(n_dot_l, alpha) * n_dot_l
+    )
     return mi.Color3f(dr.select(lit, base + m.specular * lobe, 0))
 
 
 def sample(m: Plastic, n, v, u_lobe, u2):
-    """Direction l drawn from `pdf`: visible normals of the lobe, or the cosine; u_lobe: Float, u2: Point2f. May fall below the horizon."""
+    """Direction l drawn from `pdf`: visible normals of the lobe, or the cosine; u_lobe: Float, u2:
+    Point2f. May fall below the horizon."""
     with dr.suspend_grad():
         frame = mi.Frame3f(n)
         wo = frame.to_local(v)
@@ -176,7 +217,9 @@ def sample(m: Plastic, n, v, u_lobe, u2):
         hh = mi.Vector3f(s * cos_phi, s * sin_phi, z) + vh  # Dupuy & Benyoub 2023: spherical caps
         h = dr.normalize(mi.Vector3f(hh.x * a, hh.y * a, dr.maximum(hh.z, 1e-6)))
         l_spec = 2 * dr.dot(wo, h) * h - wo
-        return frame.to_world(dr.select(u_lobe < LOBE_SHARE, l_spec, mi.warp.square_to_cosine_hemisphere(u2)))
+        return frame.to_world(
+            dr.select(u_lobe < LOBE_SHARE, l_spec, mi.warp.square_to_cosine_hemisphere(u2))
+        )
 
 
 def pdf(m: Plastic, n, v, l):

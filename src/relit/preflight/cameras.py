@@ -13,14 +13,16 @@ from relit.scene import Camera, Capture, Sphere
 PAIRS = 6  # that are matched
 NEAR = 40.0  # degrees, largest angle between the views of a pair
 LEAST = 25  # matches that say something
-AGREES = 0.02  # of the longer side: farther from its epipolar line, a match is wrong or the cameras are
+AGREES = (
+    0.02  # of the longer side: farther from its epipolar line, a match is wrong or the cameras are
+)
 SHARE = 0.5  # of the matches that lie near their lines when the cameras are right
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two photos whose points were matched. points: (N, 2, 2) pixels of the small copies. distance: (N,) pixels to the epipolar line
-    in the second, as the given cameras have it."""
+    """Two photos whose points were matched. points: (N, 2, 2) pixels of the small copies. distance:
+    (N,) pixels to the epipolar line in the second, as the given cameras have it."""
 
     first: Look
     second: Look
@@ -29,7 +31,8 @@ class Pair:
 
 
 def fundamental(first: Camera, second: Camera) -> np.ndarray:
-    """(3, 3) F with q^T F p = 0 for pixels p of the first camera and q of the second, homogeneous."""
+    """(3, 3) F with q^T F p = 0 for pixels p of the first camera and q of the second,
+    homogeneous."""
     relative = second.camera_from_world @ first.world_from_camera
     r, t = relative[:3, :3], relative[:3, 3]
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
@@ -37,7 +40,8 @@ def fundamental(first: Camera, second: Camera) -> np.ndarray:
 
 
 def match(first: Look, second: Look) -> Pair | None:
-    """SIFT matches (ratio test, mutual) of two photos and their distances to the epipolar lines, or None for too few."""
+    """SIFT matches (ratio test, mutual) of two photos and their distances to the epipolar lines, or
+    None for too few."""
     sift = cv2.SIFT_create(nfeatures=1500)
     found = []
     for x in (first, second):
@@ -47,12 +51,22 @@ def match(first: Look, second: Look) -> Pair | None:
     if da is None or db is None or len(ka) < LEAST or len(kb) < LEAST:
         return None
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    there = {m.queryIdx: m.trainIdx for m, n in (p for p in matcher.knnMatch(da, db, k=2) if len(p) == 2) if m.distance < 0.75 * n.distance}
-    back = {m.queryIdx: m.trainIdx for m, n in (p for p in matcher.knnMatch(db, da, k=2) if len(p) == 2) if m.distance < 0.8 * n.distance}
+    there = {
+        m.queryIdx: m.trainIdx
+        for m, n in (p for p in matcher.knnMatch(da, db, k=2) if len(p) == 2)
+        if m.distance < 0.75 * n.distance
+    }
+    back = {
+        m.queryIdx: m.trainIdx
+        for m, n in (p for p in matcher.knnMatch(db, da, k=2) if len(p) == 2)
+        if m.distance < 0.8 * n.distance
+    }
     both = [(i, j) for i, j in there.items() if back.get(j) == i]
     if len(both) < LEAST:
         return None
-    points = np.array([[ka[i].pt, kb[j].pt] for i, j in both]) + 0.5  # OpenCV counts from the centre of the first pixel
+    points = (
+        np.array([[ka[i].pt, kb[j].pt] for i, j in both]) + 0.5
+    )  # OpenCV counts from the centre of the first pixel
     p, q = (np.concatenate([points[:, k], np.ones((len(points), 1))], 1) for k in (0, 1))
     line = p @ fundamental(first.camera, second.camera).T
     distance = np.abs((q * line).sum(1)) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
@@ -60,16 +74,23 @@ def match(first: Look, second: Look) -> Pair | None:
 
 
 def pairs_of(looks: list[Look]) -> list[Pair]:
-    """Neighbouring views, matched: each of a few evenly chosen photos with the one whose optical axis is nearest to its own."""
+    """Neighbouring views, matched: each of a few evenly chosen photos with the one whose optical
+    axis is nearest to its own."""
     seen = [x for x in looks if x.camera is not None]
     axes = np.array([x.camera.world_from_camera[:3, 2] for x in seen])
     if len(seen) < 2:
         return []
     angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
-    moved = np.linalg.norm(np.array([x.camera.centre for x in seen])[:, None] - np.array([x.camera.centre for x in seen])[None], axis=-1)
+    moved = np.linalg.norm(
+        np.array([x.camera.centre for x in seen])[:, None]
+        - np.array([x.camera.centre for x in seen])[None],
+        axis=-1,
+    )
     angle[moved < 1e-6 * max(moved.max(), 1e-12)] = np.inf  # no epipolar lines without a baseline
     chosen: dict[tuple[int, int], float] = {}
-    for i in np.unique(np.linspace(0, len(seen) - 1, min(2 * PAIRS, len(seen))).round().astype(int)):
+    for i in np.unique(
+        np.linspace(0, len(seen) - 1, min(2 * PAIRS, len(seen))).round().astype(int)
+    ):
         j = int(np.argmin(angle[i]))
         if angle[i, j] < NEAR:
             chosen[(min(i, j), max(i, j))] = float(angle[i, j])
@@ -78,7 +99,8 @@ def pairs_of(looks: list[Look]) -> list[Pair]:
 
 
 def agreement(looks: list[Look]) -> tuple[dict | None, list[Pair]]:
-    """({pairs, matches, median (pixels of the small copies), share (near their lines)}, the pairs); None when nothing could be matched."""
+    """({pairs, matches, median (pixels of the small copies), share (near their lines)}, the pairs);
+    None when nothing could be matched."""
     pairs = pairs_of(looks)
     if not pairs:
         return None, []
@@ -96,12 +118,15 @@ def agreement(looks: list[Look]) -> tuple[dict | None, list[Pair]]:
 
 
 def reprojection(capture: Capture, looks: list[Look]) -> dict | None:
-    """Of the sparse points that came with the cameras, the share that lies in the pictures, and on the masks where there are some."""
+    """Of the sparse points that came with the cameras, the share that lies in the pictures, and on
+    the masks where there are some."""
     if capture.points is None or len(capture.points) == 0:
         return None
     points = capture.points[:: max(1, len(capture.points) // 5000)]
     if capture.sphere is not None:
-        points = points[np.linalg.norm(points - capture.sphere.centre, axis=1) < capture.sphere.radius]
+        points = points[
+            np.linalg.norm(points - capture.sphere.centre, axis=1) < capture.sphere.radius
+        ]
     if len(points) == 0:
         return None
     inside = []
@@ -109,27 +134,50 @@ def reprojection(capture: Capture, looks: list[Look]) -> dict | None:
         if x.camera is not None:
             q = x.camera.project(points)
             inside.append(
-                float(((q[:, 2] > 0) & (q[:, 0] > 0) & (q[:, 1] > 0) & (q[:, 0] < x.camera.width) & (q[:, 1] < x.camera.height)).mean())
+                float(
+                    (
+                        (q[:, 2] > 0)
+                        & (q[:, 0] > 0)
+                        & (q[:, 1] > 0)
+                        & (q[:, 0] < x.camera.width)
+                        & (q[:, 1] < x.camera.height)
+                    ).mean()
+                )
             )
-    return {"points": len(points), "in_the_pictures": round(float(np.mean(inside)), 3)} if inside else None
+    return (
+        {"points": len(points), "in_the_pictures": round(float(np.mean(inside)), 3)}
+        if inside
+        else None
+    )
 
 
 def coverage(capture: Capture) -> dict | None:
-    """How the cameras stand round the object sphere: share of the frame's shorter side that its diameter takes, photos that cut it off,
-    the widest gap between neighbouring views."""
+    """How the cameras stand round the object sphere: share of the frame's shorter side that its
+    diameter takes, photos that cut it off, the widest gap between neighbouring views."""
     if not capture.has_cameras or capture.sphere is None:
         return None
     sphere, cameras = capture.sphere, [p.camera for p in capture.photos]
-    guessed = any("viewing directions" in note for note in capture.notes)  # as large as the photos show: they cannot cut it off
+    guessed = any(
+        "viewing directions" in note for note in capture.notes
+    )  # as large as the photos show: they cannot cut it off
     fill, cut, towards = [], [], []
     for photo, camera in zip(capture.photos, cameras, strict=True):
         x, y, z = camera.project(sphere.centre)
         r = camera.fx * sphere.radius / max(z, 1e-9)
         fill.append(2 * r / min(camera.width, camera.height))
-        outside = z <= 0 or x - 0.6 * r < 0 or y - 0.6 * r < 0 or x + 0.6 * r > camera.width or y + 0.6 * r > camera.height
+        outside = (
+            z <= 0
+            or x - 0.6 * r < 0
+            or y - 0.6 * r < 0
+            or x + 0.6 * r > camera.width
+            or y + 0.6 * r > camera.height
+        )
         if outside and not guessed:
             cut.append(photo.name)
-        towards.append((camera.centre - sphere.centre) / max(np.linalg.norm(camera.centre - sphere.centre), 1e-12))
+        towards.append(
+            (camera.centre - sphere.centre)
+            / max(np.linalg.norm(camera.centre - sphere.centre), 1e-12)
+        )
     return {
         "fill": round(float(np.median(fill)), 3),
         "cut": cut,
@@ -139,7 +187,8 @@ def coverage(capture: Capture) -> dict | None:
 
 
 def widest_gap(towards: np.ndarray) -> float:
-    """Degrees from the direction least looked from, on the side of the mean view, to the nearest view. towards: (N, 3) unit."""
+    """Degrees from the direction least looked from, on the side of the mean view, to the nearest
+    view. towards: (N, 3) unit."""
     axis = towards.mean(0)
     n = 600
     z = 1 - 2 * (np.arange(n) + 0.5) / n
@@ -169,12 +218,22 @@ def warnings_of(found: dict | None, around: dict | None) -> list[dict]:
         )
     if around is not None:
         if around["fill"] < 0.25:
-            out.append({"what": f"the object sphere fills {100 * around['fill']:.0f} % of the frame", "fix": "go closer, or give --sphere"})
+            out.append(
+                {
+                    "what": f"the object sphere fills {100 * around['fill']:.0f} % of the frame",
+                    "fix": "go closer, or give --sphere",
+                }
+            )
         if len(around["cut"]) > 0.5 * around["photos"]:
             out.append(
-                {"what": f"{len(around['cut'])} photos cut the middle of the object sphere off", "fix": "step back, or give --sphere"}
+                {
+                    "what": f"{len(around['cut'])} photos cut the middle of the object sphere off",
+                    "fix": "step back, or give --sphere",
+                }
             )
         if around["widest_gap"] > 75:
-            what = f"no photo looks from within {around['widest_gap']:.0f} degrees of some directions"
+            what = (
+                f"no photo looks from within {around['widest_gap']:.0f} degrees of some directions"
+            )
             out.append({"what": what, "fix": "the far side is guessed; go all around"})
     return out

@@ -1,7 +1,8 @@
 """What kind of light the photos were taken under, guessed before anything is fitted.
 
-Four regimes: 'fixed' (the object and the lamps stand still, the camera moves), 'flash' (a lamp at the camera in a dark room),
-'varied' (each photo under another light), 'moving light' (one camera, and a lamp that moves). A guess comes with its evidence.
+Four regimes: 'fixed' (the object and the lamps stand still, the camera moves), 'flash' (a lamp at
+the camera in a dark room), 'varied' (each photo under another light), 'moving light' (one camera,
+and a lamp that moves). A guess comes with its evidence.
 """
 
 from __future__ import annotations
@@ -16,8 +17,12 @@ from relit.errors import UserError
 from relit.preflight.look import Look, look_at_photos
 from relit.scene import Capture, Sphere
 
-SAME_VIEW = 0.38  # correlation of edges; .46 for six photos from one tripod under a moving lamp, below .28 where the camera moved
-SAME_PLACE = 0.45  # overlap of the surroundings' colours; .54 and .70 in one room, .19 to .47 for one object in several places
+# correlation of edges; .46 for six photos from one tripod under a moving lamp, below .28 where the
+# camera moved
+SAME_VIEW = 0.38
+# overlap of the surroundings' colours; .54 and .70 in one room, .19 to .47 for one object in
+# several places
+SAME_PLACE = 0.45
 DARK = 0.02  # linear: surroundings of a flash photo
 CELLS = (24, 48)  # of the object sphere's directions
 SAMPLES = 1500  # pixels of a photo
@@ -26,21 +31,26 @@ NO_LIMB = 0.6  # below it no lamp stands at the camera
 NO_FRONT = 0.6  # likewise, share of the photos that are lit from the front
 ENOUGH = 12  # photos: in fewer the paint of the object can look like light from a side
 BLACK, BURNT = 0.004, 0.98  # linear: such an object shows no shading
-LIMB = 1.2  # log brightness per unit of an inflated mask's normal, towards the camera; 1.5 to 3 under a flash, below .6 elsewhere
+# log brightness per unit of an inflated mask's normal, towards the camera; 1.5 to 3 under a flash,
+# below .6 elsewhere
+LIMB = 1.2
 
 
 def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
-    """{'guess': 'fixed' | 'flash' | 'varied' | 'moving light', 'confidence': 0 to 1, 'evidence': [sentences]}.
+    """{'guess': 'fixed' | 'flash' | 'varied' | 'moving light', 'confidence': 0 to 1, 'evidence':
+    [sentences]}.
 
-    looks: the decoded copies, where they are at hand. A guess: photos with an alpha channel and no EXIF and no cameras say little,
-    and then the answer is 'fixed' with low confidence.
+    looks: the decoded copies, where they are at hand. A guess: photos with an alpha channel and no
+    EXIF and no cameras say little, and then the answer is 'fixed' with low confidence.
     """
     looks = look_at_photos(capture) if looks is None else looks
     evidence: list[str] = []
     votes = {"fixed": 0.4, "flash": 0.0, "varied": 0.0, "moving light": 0.0}
     if len(looks) > 1 and _same_view(looks, evidence):
         changes = shading_change(looks)
-        evidence.append(f"the shading of the same pixel changes by {100 * changes:.0f} % from photo to photo")
+        evidence.append(
+            f"the shading of the same pixel changes by {100 * changes:.0f} % from photo to photo"
+        )
         if changes > 0.08:
             votes["moving light"] += 1.5
     fired = [x.exif.flash for x in looks if x.exif.flash is not None]
@@ -57,23 +67,38 @@ def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
     others = max(v for k, v in votes.items() if k != guess)
     return {
         "guess": guess,
-        "confidence": round(float(np.clip((votes[guess] - others) / max(votes[guess], 0.5), 0.05, 0.95)), 2),
+        "confidence": round(
+            float(np.clip((votes[guess] - others) / max(votes[guess], 0.5), 0.05, 0.95)), 2
+        ),
         "evidence": evidence,
     }
 
 
-def check_flash_light(capture: Capture, say: Callable[[str], None], looks: list[Look] | None = None) -> None:
-    """Raises UserError where the photos were clearly not lit by a flash at the camera; says so where that is uncertain.
+def check_flash_light(
+    capture: Capture, say: Callable[[str], None], looks: list[Look] | None = None
+) -> None:
+    """Raises UserError where the photos were clearly not lit by a flash at the camera; says so
+    where that is uncertain.
 
-    Clear is one viewpoint under a moving lamp, or, in ENOUGH photos, an object that does not darken towards its outlines: a lamp at the
-    camera makes it, whatever it is made of and whatever surrounds it. looks: as for `light_regime`.
+    Clear is one viewpoint under a moving lamp, or, in ENOUGH photos, an object that does not darken
+    towards its outlines: a lamp at the camera makes it, whatever it is made of and whatever
+    surrounds it. looks: as for `light_regime`.
     """
     looks = look_at_photos(capture) if looks is None else looks
     regime, slopes = light_regime(capture, looks), limb_slopes(looks)
     fired = [x.exif.flash for x in looks if x.exif.flash is not None]
-    follows = (bool(fired) and float(np.mean(fired)) > 0.5) or any(FOLLOWS in e for e in regime["evidence"])
-    elsewhere = len(slopes) >= ENOUGH and not follows and np.median(slopes[:, 2]) < NO_LIMB and _frontal(slopes) < NO_FRONT
-    if regime["guess"] == "flash" and not elsewhere:  # dark surroundings alone are no flash: renderings on black have them too
+    follows = (bool(fired) and float(np.mean(fired)) > 0.5) or any(
+        FOLLOWS in e for e in regime["evidence"]
+    )
+    elsewhere = (
+        len(slopes) >= ENOUGH
+        and not follows
+        and np.median(slopes[:, 2]) < NO_LIMB
+        and _frontal(slopes) < NO_FRONT
+    )
+    if (
+        regime["guess"] == "flash" and not elsewhere
+    ):  # dark surroundings alone are no flash: renderings on black have them too
         return
     onward = "to go on all the same: --set check_light=false"
     if regime["guess"] == "moving light":
@@ -90,31 +115,42 @@ def check_flash_light(capture: Capture, say: Callable[[str], None], looks: list[
             f"here it does in {100 * _frontal(slopes):.0f} % of the photos. {seen}",
             f"take --capture {'collection' if regime['guess'] == 'varied' else 'multiview'}; {onward}",
         )
-    say(f"note: the light does not look like a flash at the camera, which is uncertain ({seen}); if it was none, the material is wrong")
+    say(
+        f"note: the light does not look like a flash at the camera, which is uncertain ({seen}); if it was none, the material is wrong"
+    )
 
 
 # ---------------------------------------------------------------- one camera
 
 
 def _same_view(looks: list[Look], evidence: list[str]) -> bool:
-    """Do all photos show the same view? From the poses where they are known, else from the edges."""
+    """Do all photos show the same view? From the poses where they are known, else from the
+    edges."""
     if all(x.camera is not None for x in looks):
         centres = np.stack([x.camera.centre for x in looks])
-        turns = [np.trace(looks[0].camera.world_from_camera[:3, :3].T @ x.camera.world_from_camera[:3, :3]) for x in looks]
+        turns = [
+            np.trace(
+                looks[0].camera.world_from_camera[:3, :3].T @ x.camera.world_from_camera[:3, :3]
+            )
+            for x in looks
+        ]
         reach = np.abs(centres).max() + 1e-9
         same = np.ptp(centres, axis=0).max() < 1e-3 * reach and min(turns) > 3 - 1e-4
     else:
         agreement = edge_agreement(looks)
         same = agreement > SAME_VIEW
         if same:
-            evidence.append(f"the edges of the photos lie over one another (correlation {agreement:.2f})")
+            evidence.append(
+                f"the edges of the photos lie over one another (correlation {agreement:.2f})"
+            )
     if same:
         evidence.append("all photos are taken from one place")
     return bool(same)
 
 
 def edge_agreement(looks: list[Look]) -> float:
-    """Median correlation of the edge maps of neighbouring photos, pixel by pixel: high when the camera did not move."""
+    """Median correlation of the edge maps of neighbouring photos, pixel by pixel: high when the
+    camera did not move."""
     maps = []
     for x in looks:
         gray = cv2.resize(np.log(x.gray + 0.01), (128, 128), interpolation=cv2.INTER_AREA)
@@ -127,12 +163,17 @@ def edge_agreement(looks: list[Look]) -> float:
 
 
 def shading_change(looks: list[Look]) -> float:
-    """How much a pixel's share of the picture's brightness varies over photos from one place: upper tenth over bright pixels (of the
-    object where masks are known)."""
+    """How much a pixel's share of the picture's brightness varies over photos from one place: upper
+    tenth over bright pixels (of the object where masks are known)."""
     stack = np.stack([cv2.resize(x.gray, (96, 96), interpolation=cv2.INTER_AREA) for x in looks])
     bright = stack.mean(0) > 0.25 * np.percentile(stack.mean(0), 95)
     if all(x.mask is not None for x in looks):
-        inside = np.mean([cv2.resize(x.mask, (96, 96), interpolation=cv2.INTER_AREA) for x in looks], axis=0) > 0.9
+        inside = (
+            np.mean(
+                [cv2.resize(x.mask, (96, 96), interpolation=cv2.INTER_AREA) for x in looks], axis=0
+            )
+            > 0.9
+        )
         bright = bright & inside if (bright & inside).sum() > 20 else bright
     stack = stack / np.maximum(np.median(stack[:, bright], axis=1), 1e-6)[:, None, None]
     return float(np.percentile((stack.std(0) / np.maximum(stack.mean(0), 1e-6))[bright], 90))
@@ -144,18 +185,24 @@ def shading_change(looks: list[Look]) -> float:
 def _surroundings(looks: list[Look], votes: dict, evidence: list[str]) -> None:
     seen = [x for x in looks if x.opaque]
     if not seen:
-        evidence.append("the surroundings are cut away (alpha channel), so they say nothing about the light")
+        evidence.append(
+            "the surroundings are cut away (alpha channel), so they say nothing about the light"
+        )
         return
     around = np.array([_around(x) for x in seen])  # (N, 3) median colour
     level = np.log2(np.maximum(around.mean(1), 1e-4))
     dark = float((around.mean(1) < DARK).mean())
     if dark > 0.8:
-        evidence.append(f"the surroundings are dark in {100 * dark:.0f} % of the photos (below {DARK} of white)")
+        evidence.append(
+            f"the surroundings are dark in {100 * dark:.0f} % of the photos (below {DARK} of white)"
+        )
         votes["flash"] += 0.6
         return
     chroma = around / np.maximum(around.sum(1, keepdims=True), 1e-6)
     spread, tint = float(level.std()), float(chroma.std(0).max())
-    evidence.append(f"the surroundings vary by {spread:.1f} EV and {tint:.2f} in chromaticity between photos")
+    evidence.append(
+        f"the surroundings vary by {spread:.1f} EV and {tint:.2f} in chromaticity between photos"
+    )
     cameras = {x.exif.camera for x in seen if x.exif.camera}
     sizes = {tuple(sorted(x.rgb.shape[:2])) for x in seen}
     if len(cameras) > 2:
@@ -170,14 +217,17 @@ def _surroundings(looks: list[Look], votes: dict, evidence: list[str]) -> None:
         votes["varied"] += 0.35
     if len(seen) > 2:
         overlap = colour_overlap(seen)
-        evidence.append(f"the colours around the object overlap by {100 * overlap:.0f} % from photo to photo")
+        evidence.append(
+            f"the colours around the object overlap by {100 * overlap:.0f} % from photo to photo"
+        )
         votes["varied"] += 0.5 if overlap < SAME_PLACE else 0.0
     if spread < 0.6 and tint < 0.04:
         votes["fixed"] += 0.3
 
 
 def colour_overlap(looks: list[Look]) -> float:
-    """Median over pairs of photos of the intersection of the chromaticity histograms of their margins: 1 for equal ones."""
+    """Median over pairs of photos of the intersection of the chromaticity histograms of their
+    margins: 1 for equal ones."""
     found = []
     for x in looks:
         h, w = x.rgb.shape[:2]
@@ -188,7 +238,9 @@ def colour_overlap(looks: list[Look]) -> float:
         chroma = rgb[:, :2] / (rgb.sum(1, keepdims=True) + 1e-3)
         histogram, *_ = np.histogram2d(*chroma.T, bins=24, range=[[0.1, 0.6], [0.1, 0.6]])
         found.append(cv2.GaussianBlur(histogram / max(histogram.sum(), 1), (0, 0), 0.7))
-    return float(np.median([np.minimum(a, b).sum() for i, a in enumerate(found) for b in found[:i]]))
+    return float(
+        np.median([np.minimum(a, b).sum() for i, a in enumerate(found) for b in found[:i]])
+    )
 
 
 def _around(x: Look) -> np.ndarray:
@@ -210,18 +262,22 @@ def _limb(looks: list[Look], votes: dict, evidence: list[str]) -> None:
         return
     frontal = _frontal(slopes)
     if np.median(slopes[:, 2]) > LIMB and frontal > 0.8:
-        evidence.append(f"in {100 * frontal:.0f} % of the photos the object darkens evenly towards its outline: lit from the camera")
+        evidence.append(
+            f"in {100 * frontal:.0f} % of the photos the object darkens evenly towards its outline: lit from the camera"
+        )
         votes["flash"] += 1.2
 
 
 def _frontal(slopes: np.ndarray) -> float:
-    """Share of the photos in which brightness goes with the normal's component to the camera more than to any side."""
+    """Share of the photos in which brightness goes with the normal's component to the camera more
+    than to any side."""
     return float((slopes[:, 2] > np.hypot(slopes[:, 0], slopes[:, 1])).mean())
 
 
 def limb_slopes(looks: list[Look]) -> np.ndarray:
-    """(N, 3): how log brightness goes with the normal of the inflated mask (x right, y down, z to the camera), one row per photo with a
-    mask. A lamp at the camera leaves z alone; any other one has a side."""
+    """(N, 3): how log brightness goes with the normal of the inflated mask (x right, y down, z to
+    the camera), one row per photo with a mask. A lamp at the camera leaves z alone; any other one
+    has a side."""
     found = []
     for x in looks:
         inside = None if x.mask is None else x.mask > 0.9
@@ -230,7 +286,9 @@ def limb_slopes(looks: list[Look]) -> np.ndarray:
         if not BLACK < np.median(x.gray[inside]) < BURNT:
             continue
         far = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-        height = cv2.GaussianBlur(np.sqrt(far * far.max()), (0, 0), max(1.5, 0.03 * float(np.sqrt(inside.sum()))))
+        height = cv2.GaussianBlur(
+            np.sqrt(far * far.max()), (0, 0), max(1.5, 0.03 * float(np.sqrt(inside.sum())))
+        )
         down, right = np.gradient(height)
         normal = np.stack([-right, -down, np.ones_like(height)], -1)[inside]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -262,11 +320,13 @@ def _shading(looks: list[Look], sphere: Sphere, votes: dict, evidence: list[str]
 
 
 def shading_fits(looks: list[Look], sphere: Sphere) -> tuple[float, float, float, float] | None:
-    """How brightness of one place of the object changes from photo to photo, the object taken for its sphere.
+    """How brightness of one place of the object changes from photo to photo, the object taken for
+    its sphere.
 
-    Places are cells of the sphere's directions, which takes texture out. -> (standard deviation of the log brightness about each
-    cell's mean; share of its variance that a linear function of the normal in CAMERA axes explains; share that a linear function of
-    the normal in WORLD axes, with another one for each photo, explains; the first function's slope towards the camera, per unit of
+    Places are cells of the sphere's directions, which takes texture out. -> (standard deviation of
+    the log brightness about each cell's mean; share of its variance that a linear function of the
+    normal in CAMERA axes explains; share that a linear function of the normal in WORLD axes, with
+    another one for each photo, explains; the first function's slope towards the camera, per unit of
     the normal's component), or None when too few places are seen often enough.
     """
     places, values, camera_normals, world_normals, photos = [], [], [], [], []
@@ -280,7 +340,9 @@ def shading_fits(looks: list[Look], sphere: Sphere) -> tuple[float, float, float
         camera_normals.append(n @ x.camera.world_from_camera[:3, :3])
         world_normals.append(n)
         photos.append(np.full(len(n), i))
-    place, y, nc, nw, photo = (np.concatenate(a) for a in (places, values, camera_normals, world_normals, photos))
+    place, y, nc, nw, photo = (
+        np.concatenate(a) for a in (places, values, camera_normals, world_normals, photos)
+    )
     # mean over the pixels of a cell in a photo, then over photos
     key = place * len(looks) + photo
     keys, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -309,14 +371,20 @@ def shading_fits(looks: list[Look], sphere: Sphere) -> tuple[float, float, float
 
 
 def _on_sphere(x: Look, sphere: Sphere, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (N, 3), world, and luminance (N,) of pixels that meet the object sphere, at most SAMPLES of them."""
+    """Normals (N, 3), world, and luminance (N,) of pixels that meet the object sphere, at most
+    SAMPLES of them."""
     c = x.camera
-    rows, columns = np.nonzero(x.mask > 0.9) if x.mask is not None else np.nonzero(np.ones(x.gray.shape, bool))
+    rows, columns = (
+        np.nonzero(x.mask > 0.9) if x.mask is not None else np.nonzero(np.ones(x.gray.shape, bool))
+    )
     if len(rows) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     few = np.random.default_rng(seed).permutation(len(rows))[: 4 * SAMPLES]
     rows, columns = rows[few], columns[few]
-    d = np.stack([(columns + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(rows))], 1) @ c.world_from_camera[:3, :3].T
+    d = (
+        np.stack([(columns + 0.5 - c.cx) / c.fx, (rows + 0.5 - c.cy) / c.fy, np.ones(len(rows))], 1)
+        @ c.world_from_camera[:3, :3].T
+    )
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     to = c.centre - sphere.centre
     b, q = d @ to, to @ to - (0.85 * sphere.radius) ** 2
@@ -328,6 +396,10 @@ def _on_sphere(x: Look, sphere: Sphere, seed: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _cell(n: np.ndarray) -> np.ndarray:
-    rows = np.minimum((np.arccos(np.clip(n[:, 1], -1, 1)) / np.pi * CELLS[0]).astype(int), CELLS[0] - 1)
-    columns = np.minimum(((np.arctan2(n[:, 0], n[:, 2]) / (2 * np.pi) + 0.5) * CELLS[1]).astype(int), CELLS[1] - 1)
+    rows = np.minimum(
+        (np.arccos(np.clip(n[:, 1], -1, 1)) / np.pi * CELLS[0]).astype(int), CELLS[0] - 1
+    )
+    columns = np.minimum(
+        ((np.arctan2(n[:, 0], n[:, 2]) / (2 * np.pi) + 0.5) * CELLS[1]).astype(int), CELLS[1] - 1
+    )
     return rows * CELLS[1] + columns

@@ -1,4 +1,5 @@
-"""Small copies of some of a capture's photos, decoded once for everything that the preflight measures."""
+"""Small copies of some of a capture's photos, decoded once for everything that the preflight
+measures."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ SIDE = 512  # pixels, longest side
 
 @dataclass(frozen=True)
 class Exif:
-    """What the camera wrote. camera: maker and model. exposure: seconds. fnumber, iso: as written. flash: did it fire. None: not said."""
+    """What the camera wrote. camera: maker and model. exposure: seconds. fnumber, iso: as written.
+    flash: did it fire. None: not said."""
 
     camera: str | None = None
     exposure: float | None = None
@@ -29,7 +31,8 @@ class Exif:
 
     @property
     def ev(self) -> float | None:
-        """log2 of the light that the sensor would gather from the same scene, or None when a part of it is not known."""
+        """log2 of the light that the sensor would gather from the same scene, or None when a part
+        of it is not known."""
         if not self.exposure or not self.fnumber or not self.iso:
             return None
         return float(np.log2(self.exposure * self.iso / self.fnumber**2))
@@ -37,9 +40,10 @@ class Exif:
 
 @dataclass(frozen=True)
 class Look:
-    """One photo at SIDE pixels or less. rgb: (h, w, 3) linear. mask: (h, w) or None. camera: for this size, or None.
-    sharpness: of the photo before it was shrunk, see `sharpness`. opaque: False where the file has an alpha channel, whose colours
-    outside the object say nothing."""
+    """One photo at SIDE pixels or less. rgb: (h, w, 3) linear. mask: (h, w) or None. camera: for
+    this size, or None.
+    sharpness: of the photo before it was shrunk, see `sharpness`. opaque: False where the file has
+    an alpha channel, whose colours outside the object say nothing."""
 
     name: str
     rgb: np.ndarray
@@ -57,7 +61,9 @@ class Look:
 
 def look_at_photos(capture: Capture, most: int = MOST) -> list[Look]:
     """At most `most` photos, evenly chosen."""
-    chosen = np.unique(np.linspace(0, len(capture.photos) - 1, min(most, len(capture.photos))).round().astype(int))
+    chosen = np.unique(
+        np.linspace(0, len(capture.photos) - 1, min(most, len(capture.photos))).round().astype(int)
+    )
     return [look(capture, capture.photos[i]) for i in chosen]
 
 
@@ -67,18 +73,33 @@ def look(capture: Capture, photo: Photo) -> Look:
     s = min(1.0, SIDE / max(h, w))
     size = (max(1, round(w * s)), max(1, round(h * s)))
     rgb, mask = (
-        None if a is None else cv2.resize(np.ascontiguousarray(a), size, interpolation=cv2.INTER_AREA) for a in (pixels.rgb, pixels.mask)
+        None
+        if a is None
+        else cv2.resize(np.ascontiguousarray(a), size, interpolation=cv2.INTER_AREA)
+        for a in (pixels.rgb, pixels.mask)
     )
     camera = None if photo.camera is None else photo.camera.resized(*size)
     path = capture.folder / photo.name
-    return Look(photo.name, rgb, mask, camera, sharpness(pixels.rgb, pixels.mask), _opaque(path), read_exif(path))
+    return Look(
+        photo.name,
+        rgb,
+        mask,
+        camera,
+        sharpness(pixels.rgb, pixels.mask),
+        _opaque(path),
+        read_exif(path),
+    )
 
 
 def sharpness(rgb: np.ndarray, mask: np.ndarray | None) -> float:
-    """Contrast of the finest detail over that of detail four times as coarse, on the object where a mask is known. A blurred photo
-    loses the first and keeps the second, whatever it shows."""
+    """Contrast of the finest detail over that of detail four times as coarse, on the object where a
+    mask is known. A blurred photo loses the first and keeps the second, whatever it shows."""
     gray = np.sqrt(np.maximum(rgb @ np.array([0.2126, 0.7152, 0.0722], np.float32), 0))
-    inside = np.ones(gray.shape, bool) if mask is None else cv2.erode((mask > 0.5).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    inside = (
+        np.ones(gray.shape, bool)
+        if mask is None
+        else cv2.erode((mask > 0.5).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    )
     if inside.sum() < 100:
         inside = np.ones(gray.shape, bool)
     bands = []
@@ -97,7 +118,11 @@ def _opaque(path: Path) -> bool:
 
 def read_exif(path: Path) -> Exif:
     """The camera's record; empty where the file has none or it is damaged."""
-    if path.suffix.lower() not in CODED | HEIC or path.suffix.lower() == ".png" or not path.is_file():
+    if (
+        path.suffix.lower() not in CODED | HEIC
+        or path.suffix.lower() == ".png"
+        or not path.is_file()
+    ):
         return Exif()
     try:
         with pil(path) as image:

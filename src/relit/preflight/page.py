@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 
 from relit.conventions import srgb_from_linear
-from relit.evaluate.curves import curve
 from relit.files import disk_errors, write_text
 from relit.preflight.cameras import AGREES, Pair, fundamental, sphere_outline
 from relit.preflight.look import Look
 from relit.preflight.text import rows_of
+from relit.report.curves import curve
 from relit.scene import Capture
 
 SIDE = 260  # pixels of a thumbnail
@@ -29,28 +29,49 @@ svg{background:#fff;border:1px solid #ddd;border-radius:3px}
 """
 
 
-def write_page(path: Path, found: dict, capture: Capture, looks: list[Look], pairs: list[Pair], plot: str | None) -> None:
+def write_page(
+    path: Path,
+    found: dict,
+    capture: Capture,
+    looks: list[Look],
+    pairs: list[Pair],
+    plot: str | None,
+) -> None:
     """Write the page. found: the answer of `inspect`. plot: the cameras as SVG, or None."""
     warnings = (
-        "".join(f"<div class=warn>{escape(w['what'])}<small>{escape(w['fix'])}</small></div>" for w in found["warnings"])
+        "".join(
+            f"<div class=warn>{escape(w['what'])}<small>{escape(w['fix'])}</small></div>"
+            for w in found["warnings"]
+        )
         or "<p>Nothing odd was seen.</p>"
     )
     table = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows_of(found))
     notes = "".join(f"<li>{escape(n)}</li>" for n in found["notes"])
     regime = found["light_regime"]
     evidence = "".join(f"<li>{escape(e)}</li>" for e in regime["evidence"])
-    drawn = "".join(_thumbnail(x, capture, row) for x, row in zip(looks, found["drift"]["photos"], strict=True))
+    drawn = "".join(
+        _thumbnail(x, capture, row) for x, row in zip(looks, found["drift"]["photos"], strict=True)
+    )
     parts = [
         f"<h1>{escape(Path(found['input']).name or found['input'])}</h1><table>{table}</table>",
         _section("What is odd", warnings),
         _section("Notes of the reader", f"<ul>{notes}</ul>" if notes else ""),
-        _section(f"Light: {regime['guess']}, confidence {100 * regime['confidence']:.0f} %", f"<ul>{evidence}</ul>" if evidence else ""),
-        _section("Cameras around the object sphere", plot or ""),
-        _section("Matches and the epipolar lines of the given cameras", "".join(_pair(p) for p in _worst(pairs))),
         _section(
-            f"Photos ({len(looks)} of {found['photos']}), masks in colour, the object sphere as a circle", f"<div class=row>{drawn}</div>"
+            f"Light: {regime['guess']}, confidence {100 * regime['confidence']:.0f} %",
+            f"<ul>{evidence}</ul>" if evidence else "",
         ),
-        _section("From photo to photo", f"<div class=row>{_drifts(found['drift']['photos'])}</div>"),
+        _section("Cameras around the object sphere", plot or ""),
+        _section(
+            "Matches and the epipolar lines of the given cameras",
+            "".join(_pair(p) for p in _worst(pairs)),
+        ),
+        _section(
+            f"Photos ({len(looks)} of {found['photos']}), masks in colour, the object sphere as a circle",
+            f"<div class=row>{drawn}</div>",
+        ),
+        _section(
+            "From photo to photo", f"<div class=row>{_drifts(found['drift']['photos'])}</div>"
+        ),
     ]
     title = escape(f"Relit preflight: {Path(found['input']).name}")
     head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
@@ -67,7 +88,9 @@ def _codes(rgb: np.ndarray) -> np.ndarray:
 
 
 def _uri(codes: np.ndarray) -> str:
-    ok, data = cv2.imencode(".jpg", np.ascontiguousarray(codes[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
+    ok, data = cv2.imencode(
+        ".jpg", np.ascontiguousarray(codes[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82]
+    )
     assert ok
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
@@ -79,24 +102,40 @@ def _figure(codes: np.ndarray, caption: str) -> str:
 
 
 def overlaid(x: Look, capture: Capture) -> np.ndarray:
-    """(h, w, 3) uint8: the photo, darker and bluish off its mask, with the outline of the object sphere."""
+    """(h, w, 3) uint8: the photo, darker and bluish off its mask, with the outline of the object
+    sphere."""
     s = SIDE / max(x.gray.shape)
     size = (max(1, round(x.gray.shape[1] * s)), max(1, round(x.gray.shape[0] * s)))
     codes = cv2.resize(_codes(x.rgb), size, interpolation=cv2.INTER_AREA)
     if x.mask is not None:
         mask = cv2.resize(x.mask, size, interpolation=cv2.INTER_AREA)[..., None]
-        codes = (codes * (0.35 + 0.65 * mask) + np.array([40, 60, 130]) * 0.6 * (1 - mask)).clip(0, 255).astype(np.uint8)
+        codes = (
+            (codes * (0.35 + 0.65 * mask) + np.array([40, 60, 130]) * 0.6 * (1 - mask))
+            .clip(0, 255)
+            .astype(np.uint8)
+        )
     if x.camera is not None and capture.sphere is not None:
         cx, cy, r = (v * s for v in sphere_outline(x.camera, capture.sphere))
         if max(abs(cx), abs(cy), r) < 1e4:
-            codes = cv2.circle(np.ascontiguousarray(codes), (round(cx), round(cy)), max(1, round(r)), (255, 170, 60), 1, cv2.LINE_AA)
+            codes = cv2.circle(
+                np.ascontiguousarray(codes),
+                (round(cx), round(cy)),
+                max(1, round(r)),
+                (255, 170, 60),
+                1,
+                cv2.LINE_AA,
+            )
     return codes
 
 
 def _thumbnail(x: Look, capture: Capture, row: dict) -> str:
     e = x.exif
     said = [f"{row['ev']:+.1f} EV", f"sharpness {row['sharpness']:.2f}"]
-    said += [f"1/{1 / e.exposure:.0f} s" if e.exposure < 0.5 else f"{e.exposure:.1f} s"] if e.exposure else []
+    said += (
+        [f"1/{1 / e.exposure:.0f} s" if e.exposure < 0.5 else f"{e.exposure:.1f} s"]
+        if e.exposure
+        else []
+    )
     said += [f"f/{e.fnumber:.1f}"] if e.fnumber else []
     said += [f"ISO {e.iso:.0f}"] if e.iso else []
     said += ["flash"] if e.flash else []
@@ -106,7 +145,9 @@ def _thumbnail(x: Look, capture: Capture, row: dict) -> str:
 
 def _worst(pairs: list[Pair]) -> list[Pair]:
     """The pair that agrees least, and the one that agrees most."""
-    order = sorted(pairs, key=lambda p: float((p.distance < AGREES * max(p.second.gray.shape)).mean()))
+    order = sorted(
+        pairs, key=lambda p: float((p.distance < AGREES * max(p.second.gray.shape)).mean())
+    )
     return order[:1] + (order[-1:] if len(order) > 1 else [])
 
 
@@ -116,7 +157,12 @@ def _pair(p: Pair) -> str:
     f = fundamental(p.first.camera, p.second.camera)
     chosen = np.linspace(0, len(p.points) - 1, min(LINES, len(p.points))).round().astype(int)
     for k, i in enumerate(chosen):
-        colour = tuple(int(v) for v in cv2.cvtColor(np.uint8([[[k * 180 // LINES, 220, 255]]]), cv2.COLOR_HSV2RGB)[0, 0])
+        colour = tuple(
+            int(v)
+            for v in cv2.cvtColor(np.uint8([[[k * 180 // LINES, 220, 255]]]), cv2.COLOR_HSV2RGB)[
+                0, 0
+            ]
+        )
         q, r = p.points[i]
         l0, l1, l2 = f @ [q[0], q[1], 1]
         ends = (
@@ -142,4 +188,11 @@ def _drifts(rows: list[dict]) -> str:
         "blue": "blue over green, log2",
         "sharpness": f"sharpness {against}",
     }
-    return "".join(curve(text, [(i, row[key]) for i, row in enumerate(rows)]) for key, text in names.items()) if len(rows) > 1 else ""
+    return (
+        "".join(
+            curve(text, [(i, row[key]) for i, row in enumerate(rows)])
+            for key, text in names.items()
+        )
+        if len(rows) > 1
+        else ""
+    )

@@ -7,25 +7,54 @@ from relit.log import readable_bytes, readable_seconds
 
 def rows_of(found: dict) -> list[tuple[str, str]]:
     """(name, what was found) of the answer of `inspect`."""
-    sphere, masks, cost, regime = found["sphere"], found["masks"], found["estimate"], found["light_regime"]
-    sizes = ", ".join(f"{w}x{h}" for w, h in found["sizes"][:4]) + (" ..." if len(found["sizes"]) > 4 else "")
-    ball = "centre {:.4g} {:.4g} {:.4g}, radius {:.4g}".format(*sphere["centre"], sphere["radius"]) if sphere else "not known yet"
+    sphere, masks, cost, regime = (
+        found["sphere"],
+        found["masks"],
+        found["estimate"],
+        found["light_regime"],
+    )
+    sizes = ", ".join(f"{w}x{h}" for w, h in found["sizes"][:4]) + (
+        " ..." if len(found["sizes"]) > 4 else ""
+    )
+    ball = (
+        "centre {:.4g} {:.4g} {:.4g}, radius {:.4g}".format(*sphere["centre"], sphere["radius"])
+        if sphere
+        else "not known yet"
+    )
     forecast = f"{readable_seconds(cost['seconds'])}, {readable_bytes(cost['memory'])} of memory"
-    covered = "none" if masks is None else "cover " + ", ".join(f"{100 * c:.0f} % of {n}" for n, c in list(masks.items())[:4])
+    covered = (
+        "none"
+        if masks is None
+        else "cover " + ", ".join(f"{100 * c:.0f} % of {n}" for n, c in list(masks.items())[:4])
+    )
     rows = [
         ("input", found["input"]),
         ("recognised as", found["format"]),
-        ("photos", f"{found['photos']} of {sizes} pixels" + (f", {found['held_out']} held out" if found["held_out"] else "")),
+        (
+            "photos",
+            f"{found['photos']} of {sizes} pixels"
+            + (f", {found['held_out']} held out" if found["held_out"] else ""),
+        ),
         ("cameras", found["cameras"]),
     ]
     if found["epipolar"]:
         e = found["epipolar"]
         near = "" if e["median"] is None else f", {e['median']:.2f} pixels from them"
-        rows.append(("epipolar check", f"{100 * e['share']:.0f} % of {e['matches']} matches near their lines{near}"))
+        rows.append(
+            (
+                "epipolar check",
+                f"{100 * e['share']:.0f} % of {e['matches']} matches near their lines{near}",
+            )
+        )
     rows.append(("object sphere", ball))
     if found["coverage"]:
         c = found["coverage"]
-        rows.append(("", f"fills {100 * c['fill']:.0f} % of the frame; widest gap between views {c['widest_gap']:.0f} degrees"))
+        rows.append(
+            (
+                "",
+                f"fills {100 * c['fill']:.0f} % of the frame; widest gap between views {c['widest_gap']:.0f} degrees",
+            )
+        )
     drift = found["drift"]
     tints = f"exposure {drift['exposure_spread']:.2f} EV, tint {drift['tint_spread']:.2f}"
     rows += [

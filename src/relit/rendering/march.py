@@ -1,20 +1,24 @@
 """Volume rendering of a signed distance field: one custom operation with a hand-written adjoint.
 
-NeuS (Wang et al. 2021, Eq. 13): along a ray, between two samples with signed distances s_i and s_{i+1},
+NeuS (Wang et al. 2021, Eq. 13): along a ray, between two samples with signed distances s_i and
+s_{i+1},
 
-    α_i = max((Φ(s_i) - Φ(s_{i+1})) / Φ(s_i), 0),   Φ(x) = 1 / (1 + exp(-x / width)),   T_i = Π_{j<i} (1 - α_j),   w_i = T_i α_i
+    α_i = max((Φ(s_i) - Φ(s_{i+1})) / Φ(s_i), 0),   Φ(x) = 1 / (1 + exp(-x / width)),   T_i =
+    Π_{j<i} (1 - α_j),   w_i = T_i α_i
 
-and the operation returns per ray Σ w f (features), Σ w (opacity), Σ w t (depth) and Σ w ∇s (normal, not normalised).
+and the operation returns per ray Σ w f (features), Σ w (opacity), Σ w t (depth) and Σ w ∇s (normal,
+not normalised).
 
-The adjoint replays the march instead of storing samples. With v_i = gF·f_i + gD t_i + gN·∇s_i (f and ∇s at the END
-of step i, t in its middle) the loss is Σ w_i v_i + gT T_end, so
+The adjoint replays the march instead of storing samples. With v_i = gF·f_i + gD t_i + gN·∇s_i (f
+and ∇s at the END of step i, t in its middle) the loss is Σ w_i v_i + gT T_end, so
 
     ∂L/∂α_i = T_i v_i - (Σ_{j>i} w_j v_j + gT T_end) / (1 - α_i),
 
-and Σ_{j>i} w_j v_j is the known total (from the outputs of the forward pass) minus a running sum. Gradients go to the rows of
-the field and to ray origins and directions. Sample positions t along a ray are constants of the quadrature; `inv_s`,
-`t0`, `t1` and `dt` receive no gradient. The trilinear ∇s jumps from cell to cell: of a normal that changes because the ray moves
-(not because the field does) only the change within cells reaches o and d.
+and Σ_{j>i} w_j v_j is the known total (from the outputs of the forward pass) minus a running sum.
+Gradients go to the rows of the field and to ray origins and directions. Sample positions t along a
+ray are constants of the quadrature; `inv_s`, `t0`, `t1` and `dt` receive no gradient. The trilinear
+∇s jumps from cell to cell: of a normal that changes because the ray moves (not because the field
+does) only the change within cells reaches o and d.
 """
 
 from __future__ import annotations
@@ -30,7 +34,8 @@ from relit.geometry.sdf import SdfGrid, sums_into
 MAX_STEPS = 600
 MIN_ALPHA = 1e-3  # samples below it contribute nothing and are not shaded
 MIN_TRANSMITTANCE = 1e-3
-ACCELERATE = 5.0  # in empty space a step reaches to where |s| inv_s = ACCELERATE, where Φ is within 1 % of 0 or 1
+# in empty space a step reaches to where |s| inv_s = ACCELERATE, where Φ is within 1 % of 0 or 1
+ACCELERATE = 5.0
 
 
 @dataclass
@@ -45,7 +50,10 @@ def _cell(p, n: int) -> Cell:
     half = 0.5 * (n - 1)
     q = [dr.fma(c, half, half) for c in (p.x, p.y, p.z)]
     i = [dr.clip(mi.Int32(dr.floor(c)), 0, n - 2) for c in q]
-    return Cell(mi.UInt32((i[2] * n + i[1]) * n + i[0]), [c - mi.Float(k) for c, k in zip(q, i, strict=False)])
+    return Cell(
+        mi.UInt32((i[2] * n + i[1]) * n + i[0]),
+        [c - mi.Float(k) for c, k in zip(q, i, strict=False)],
+    )
 
 
 def _corners(cell: Cell, n: int):
@@ -59,7 +67,12 @@ def _corners(cell: Cell, n: int):
 
 
 def _fetch8(values, cell: Cell, n: int):
-    return [dr.gather(mi.Float, values, cell.base + (dz * n + dy) * n + dx) for dz in (0, 1) for dy in (0, 1) for dx in (0, 1)]
+    return [
+        dr.gather(mi.Float, values, cell.base + (dz * n + dy) * n + dx)
+        for dz in (0, 1)
+        for dy in (0, 1)
+        for dx in (0, 1)
+    ]
 
 
 def _trilinear(c, f):
@@ -152,7 +165,11 @@ def _scatter_point(grid, gs, cell, g, g_gradient, active):
             for dx in (0, 1):
                 wx, sx = (fx, k) if dx else (1 - fx, -k)
                 value = g * (wx * wy * wz)
-                value += g_gradient.x * (sx * wy * wz) + g_gradient.y * (wx * sy * wz) + g_gradient.z * (wx * wy * sz)
+                value += (
+                    g_gradient.x * (sx * wy * wz)
+                    + g_gradient.y * (wx * sy * wz)
+                    + g_gradient.z * (wx * wy * sz)
+                )
                 row = dr.gather(mi.UInt32, grid.index, cell.base + (dz * n + dy) * n + dx, active)
                 dr.scatter_add(gs, value, row, active, mode=sums_into(grid.rows))
 
@@ -169,8 +186,12 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
     c8 = _fetch8(grid.values, cell, n)
     s0 = _trilinear(c8, cell.f)
     n0 = _trilinear_gradient(c8, cell.f, n)
-    pending, pendingN = mi.Float(0), mi.Vector3f(0)  # ∂L/∂s_0 and ∂L/∂∇s_0 left by the step before: one scatter per point
-    # One turn more than the march where a point still waits for its scatter: a scatter after the loop would run the loop twice.
+    pending, pendingN = (
+        mi.Float(0),
+        mi.Vector3f(0),
+    )  # ∂L/∂s_0 and ∂L/∂∇s_0 left by the step before: one scatter per point
+    # One turn more than the march where a point still waits for its scatter: a scatter after the
+    # loop would run the loop twice.
     while ((t < t1) & (T > MIN_TRANSMITTANCE) & (i < MAX_STEPS)) | (pending != 0):
         alive = (t < t1) & (T > MIN_TRANSMITTANCE) & (i < MAX_STEPS)
         step = dr.maximum(dt, s0 - ACCELERATE / inv_s)
@@ -196,7 +217,9 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
             remainder -= w * v
             rest = dr.maximum(1 - alpha, 1e-3)
             galpha = T * v - (remainder + gT * T_end) / rest
-            galpha = dr.select(shaded & (alpha < 1), galpha, 0)  # the clip passes no gradient outside
+            galpha = dr.select(
+                shaded & (alpha < 1), galpha, 0
+            )  # the clip passes no gradient outside
             ga1 = -galpha / (a0 + 1e-5)
             ga0 = galpha * (a1 + 1e-5) / dr.square(a0 + 1e-5)
             g1 = ga1 * a1 * (1 - a1) * inv_s
@@ -205,9 +228,17 @@ def _replay(grid: SdfGrid, features, o, d, t0, t1, inv_s, dt, total, T_end, gF, 
             # features and normal at the end of the step
             gp = _trilinear_hessian_times(c8, end.f, gN1, n)
             for k in range(packets):
-                gfk = mi.Vector4f(gF[4 * k] * w, gF[4 * k + 1] * w, gF[4 * k + 2] * w, gF[4 * k + 3] * w)
+                gfk = mi.Vector4f(
+                    gF[4 * k] * w, gF[4 * k + 1] * w, gF[4 * k + 2] * w, gF[4 * k + 3] * w
+                )
                 for row, weight in zip(rows8, weights, strict=False):
-                    dr.scatter_add(gf, gfk * weight, row * packets + k, shaded, mode=sums_into(grid.rows * grid.channels))
+                    dr.scatter_add(
+                        gf,
+                        gfk * weight,
+                        row * packets + k,
+                        shaded,
+                        mode=sums_into(grid.rows * grid.channels),
+                    )
                 gp += _feature_position_gradient(features, rows8, end.f, gfk, packets, k, n)
             go += gp
             gd += gp * tn
@@ -235,7 +266,16 @@ class _MarchOp(dr.CustomOp):
 
     def eval(self, grid, row_values, features, o, d, t0, t1, inv_s, dt):
         del row_values  # stands for grid.values, which holds the same numbers
-        self.args = (grid, dr.detach(features), dr.detach(o), dr.detach(d), dr.detach(t0), dr.detach(t1), inv_s, dt)
+        self.args = (
+            grid,
+            dr.detach(features),
+            dr.detach(o),
+            dr.detach(d),
+            dr.detach(t0),
+            dr.detach(t1),
+            inv_s,
+            dt,
+        )
         with dr.suspend_grad():
             F, N, D, T, steps = _march(*self.args)
             dr.eval(F, N, D, T, steps)  # or the adjoint would march twice
@@ -253,7 +293,9 @@ class _MarchOp(dr.CustomOp):
             gs = dr.zeros(mi.Float, grid.rows)
             gf = dr.zeros(mi.Float, grid.rows * grid.channels)
             dr.eval(total, gF, gN, gD, gT, T)
-            go, gd = _replay(grid, features, o, d, t0, t1, inv_s, dt, total, T, gF, gN, gD, gT, gs, gf)
+            go, gd = _replay(
+                grid, features, o, d, t0, t1, inv_s, dt, total, T, gF, gN, gD, gT, gs, gf
+            )
         self.set_grad_in("row_values", gs)
         self.set_grad_in("features", gf)
         self.set_grad_in("o", go)
@@ -268,8 +310,9 @@ class _MarchOp(dr.CustomOp):
 
 @dataclass
 class Marched:
-    """Per ray: features (list of Floats, Σ w f), normal (Vector3f, Σ w ∇s, not normalised), depth (Float, Σ w t),
-    transmittance (Float; opacity = 1 - transmittance), steps (UInt32, not differentiable)."""
+    """Per ray: features (list of Floats, Σ w f), normal (Vector3f, Σ w ∇s, not normalised), depth
+    (Float, Σ w t), transmittance (Float; opacity = 1 - transmittance), steps (UInt32, not
+    differentiable)."""
 
     features: list
     normal: Any
@@ -292,16 +335,23 @@ class Marched:
 
 
 def march(grid: SdfGrid, o, d, t0, t1, inv_s, dt) -> Marched:
-    """Render `grid` along rays o + t d, t in [t0, t1] (unit frame; an empty interval gives opacity 0).
+    """Render `grid` along rays o + t d, t in [t0, t1] (unit frame; an empty interval gives opacity
+    0).
 
-    o: Point3f or Vector3f, d: Vector3f (unit), t0, t1: Float. inv_s: opaque Float, 1 / width of Φ. dt: opaque Float, the
-    smallest step. Differentiable with respect to grid.row_values, grid.features, o and d.
+    o: Point3f or Vector3f, d: Vector3f (unit), t0, t1: Float. inv_s: opaque Float, 1 / width of Φ.
+    dt: opaque Float, the smallest step. Differentiable with respect to grid.row_values,
+    grid.features, o and d.
     """
-    return Marched(*dr.custom(_MarchOp, grid, grid.row_values, grid.features, mi.Vector3f(o), d, t0, t1, inv_s, dt))
+    return Marched(
+        *dr.custom(
+            _MarchOp, grid, grid.row_values, grid.features, mi.Vector3f(o), d, t0, t1, inv_s, dt
+        )
+    )
 
 
 def sphere_interval(o, d, radius=1.0):
-    """Entry and exit distances (Float, Float) of rays through the sphere around the origin; t1 <= t0 where they miss."""
+    """Entry and exit distances (Float, Float) of rays through the sphere around the origin; t1 <=
+    t0 where they miss."""
     b = dr.dot(o, d)
     disc = b * b - (dr.dot(o, o) - radius * radius)
     root = dr.sqrt(dr.maximum(disc, 0))

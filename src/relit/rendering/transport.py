@@ -1,10 +1,12 @@
 """Monte Carlo light transport on a mesh under an environment: what the surface pass differentiates.
 
-SfD Eq. (3): L_o(w_o; x) = ∫ L_i(w_i) f_r(w_i, w_o; x) (w_i·n) dw_i, with many directions at each of few surface points. Half of the
-directions follow the light, half the BRDF (balance heuristic over the mixture). Visibility is traced. Where a direction is blocked, the
-light that arrives is the radiance of the surface that blocks it: the mean radiance that the photos show there, so every inter-reflection
-is in it, and it is a constant of the fit. Directions, visibility and densities are detached (no boundary term: this pass cannot
-move silhouettes or shadow edges).
+SfD Eq. (3): L_o(w_o; x) = ∫ L_i(w_i) f_r(w_i, w_o; x) (w_i·n) dw_i, with many directions at each of
+few surface points. Half of the directions follow the light, half the BRDF (balance heuristic over
+the mixture). Visibility is traced. Where a direction is blocked, the
+light that arrives is the radiance of the surface that blocks it: the mean radiance that the photos
+show there, so every inter-reflection is in it, and it is a constant of the fit. Directions,
+visibility and densities are detached (no boundary term: this pass cannot move silhouettes or shadow
+edges).
 """
 
 from __future__ import annotations
@@ -19,9 +21,9 @@ import numpy as np
 from relit.geometry.tangents import vertex_tangents
 from relit.lighting.environment import Environment
 from relit.materials.brdf import Surface, evaluate, pdf, sample
+from relit.reference.mitsuba_scene import build_geometry
+from relit.reference.path import SmoothOrigins
 from relit.rendering.blocks import block_sums, repeat
-from relit.rendering.mitsuba_scene import build_geometry
-from relit.rendering.path import SmoothOrigins
 from relit.scene import Mesh
 
 OFFSET = 1e-3  # of the unit frame, along the normal
@@ -29,8 +31,9 @@ NO_TEXELS = -0.5  # texture coordinates below are those of faces without texels
 
 
 class TraceableMesh:
-    """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray queries. Faces whose uvs are below
-    NO_TEXELS carry none: they only block (the ground of a photo of duplicates)."""
+    """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray
+    queries. Faces whose uvs are below NO_TEXELS carry none: they only block (the ground of a photo
+    of duplicates)."""
 
     def __init__(self, mesh: Mesh, radiance: np.ndarray):
         self.mesh, self.scene = mesh, build_geometry(mesh)
@@ -43,9 +46,11 @@ class TraceableMesh:
 
 @dataclass
 class Points:
-    """Surface points seen along rays. valid: Bool. x: Point3f on the smooth surface. n: Vector3f unit shading normal. geometric: Vector3f.
-    v: Vector3f to the viewer. uv: Point2f, v = 0 at the top row of textures. t, b: Vector3f unit tangent and bitangent of normal maps,
-    orthogonal to the interpolated normal (glTF 2.0, Sec. 3.9.3)."""
+    """Surface points seen along rays. valid: Bool. x: Point3f on the smooth surface. n: Vector3f
+    unit shading normal. geometric: Vector3f.
+    v: Vector3f to the viewer. uv: Point2f, v = 0 at the top row of textures. t, b: Vector3f unit
+    tangent and bitangent of normal maps, orthogonal to the interpolated normal (glTF 2.0, Sec.
+    3.9.3)."""
 
     valid: Any
     x: Any
@@ -63,12 +68,18 @@ def first_hits(mesh: TraceableMesh, o, d) -> Points:
         ray = mi.Ray3f(mi.Point3f(o), d)
         pi = mesh.scene.ray_intersect_preliminary(ray, coherent=False)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
-        hit = si.is_valid() & dr.isfinite(pi.prim_uv.x + pi.prim_uv.y)  # a sliver can give barycentric coordinates that are no numbers
+        hit = si.is_valid() & dr.isfinite(
+            pi.prim_uv.x + pi.prim_uv.y
+        )  # a sliver can give barycentric coordinates that are no numbers
         b = (1 - pi.prim_uv.x - pi.prim_uv.y, pi.prim_uv.x, pi.prim_uv.y)
         corner = [dr.gather(mi.UInt32, mesh.faces, pi.prim_index * 3 + k, hit) for k in range(3)]
         n = sum(b[k] * dr.gather(mi.Vector3f, mesh.normals, corner[k], hit) for k in range(3))
-        n = dr.select(hit, dr.normalize(n), mi.Vector3f(0, 0, 1))  # a miss must not become a NaN that meets a zero weight
-        uv = dr.select(hit, sum(b[k] * dr.gather(mi.Point2f, mesh.uvs, corner[k], hit) for k in range(3)), 0)
+        n = dr.select(
+            hit, dr.normalize(n), mi.Vector3f(0, 0, 1)
+        )  # a miss must not become a NaN that meets a zero weight
+        uv = dr.select(
+            hit, sum(b[k] * dr.gather(mi.Point2f, mesh.uvs, corner[k], hit) for k in range(3)), 0
+        )
         x = dr.select(hit, mi.Point3f(mesh.origins.shifted(si, pi.prim_uv, hit)), 0)
         t = sum(b[k] * dr.gather(mi.Vector4f, mesh.tangents, corner[k], hit) for k in range(3))
         along = mi.Vector3f(t.x, t.y, t.z)
@@ -82,14 +93,17 @@ def first_hits(mesh: TraceableMesh, o, d) -> Points:
 
 
 def bent_normal(points: Points, slope):
-    """The normal of a normal map, n + slope.x t + slope.y b made unit (Vector3f); differentiable in slope (Point2f or Vector2f)."""
+    """The normal of a normal map, n + slope.x t + slope.y b made unit (Vector3f); differentiable in
+    slope (Point2f or Vector2f)."""
     return dr.normalize(points.n + slope.x * points.t + slope.y * points.b)
 
 
 @dataclass
 class Lights:
-    """`count` directions for each point, point-major. l: Vector3f. weight: Float, 1 / (count * density), 0 where a direction is useless.
-    visible: Float, 1 where nothing blocks. blocked: Color3f, radiance of the blocker, 0 where visible. point: UInt32."""
+    """`count` directions for each point, point-major. l: Vector3f. weight: Float, 1 / (count *
+    density), 0 where a direction is useless.
+    visible: Float, 1 where nothing blocks. blocked: Color3f, radiance of the blocker, 0 where
+    visible. point: UInt32."""
 
     count: int
     l: Any
@@ -102,23 +116,33 @@ class Lights:
 def low_discrepancy(count: int) -> np.ndarray:
     """(count, 3) points of the R3 sequence (Roberts 2018)."""
     g = 1.2207440846057596
-    return ((np.arange(count)[:, None] + 0.5) * np.array([1 / g, 1 / g**2, 1 / g**3]) % 1.0).astype(np.float32)
+    return ((np.arange(count)[:, None] + 0.5) * np.array([1 / g, 1 / g**2, 1 / g**3]) % 1.0).astype(
+        np.float32
+    )
 
 
-def sample_lights(mesh: TraceableMesh, points: Points, surface: Surface, environment: Environment, count: int, rng) -> Lights:
-    """Draw and trace `count` (a multiple of 4) directions per point. rng: PCG32 with one lane per point. Detached."""
+def sample_lights(
+    mesh: TraceableMesh, points: Points, surface: Surface, environment: Environment, count: int, rng
+) -> Lights:
+    """Draw and trace `count` (a multiple of 4) directions per point. rng: PCG32 with one lane per
+    point. Detached."""
     with dr.suspend_grad():
         total = dr.width(points.x)
         quarter = count // 4
         base = mi.Float(low_discrepancy(quarter).T.ravel())
-        shifts = [mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32()) for _ in range(4)]
+        shifts = [
+            mi.Vector3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+            for _ in range(4)
+        ]
         dr.eval(shifts, rng)
         index = dr.arange(mi.UInt32, total * count)
         point, j = index // count, index % count
         odd, k = (j & 1) == 1, j >> 1
         from_light = k < quarter
         k = dr.select(from_light, k, k - quarter)
-        s = [dr.gather(mi.Vector3f, c, point) for c in shifts]  # independent for the even and the odd half, and for the two strategies
+        s = [
+            dr.gather(mi.Vector3f, c, point) for c in shifts
+        ]  # independent for the even and the odd half, and for the two strategies
         s = dr.select(odd, dr.select(from_light, s[0], s[1]), dr.select(from_light, s[2], s[3]))
         u = [dr.gather(mi.Float, base, k + quarter * c) for c in range(3)]
         u = [dr.minimum(a - dr.floor(a), 0.9999999) for a in (u[0] + s.x, u[1] + s.y, u[2] + s.z)]
@@ -158,13 +182,17 @@ def surface_at(surface: Surface, point) -> Surface:
 
 
 def reflected(points: Points, lights: Lights, surface: Surface, environment: Environment):
-    """Radiance towards the viewer (two Color3f, estimated from the even and from the odd directions of each point).
+    """Radiance towards the viewer (two Color3f, estimated from the even and from the odd directions
+    of each point).
 
-    Differentiable in the surface's material, in points.n and in environment.radiance. The product of the two residuals is an unbiased
-    estimate of the squared error; the square of one estimate would pull towards materials with less noise.
+    Differentiable in the surface's material, in points.n and in environment.radiance. The product
+    of the two residuals is an unbiased estimate of the squared error; the square of one estimate
+    would pull towards materials with less noise.
     """
     v = dr.gather(mi.Vector3f, points.v, lights.point)
-    n, *material = repeat((points.n, surface.base, surface.roughness, surface.metallic), lights.count)
+    n, *material = repeat(
+        (points.n, surface.base, surface.roughness, surface.metallic), lights.count
+    )
     m = Surface(*material, surface.f0)
     arriving = environment.eval(lights.l) * lights.visible + lights.blocked
     value = evaluate(m, n, v, lights.l) * arriving * (2 * lights.weight)

@@ -1,4 +1,5 @@
-"""`relit inspect INPUT --edit`: the page where masks are painted and boxes drawn, kept beside the capture."""
+"""`relit inspect INPUT --edit`: the page where masks are painted and boxes drawn, kept beside the
+capture."""
 
 from __future__ import annotations
 
@@ -9,7 +10,14 @@ from urllib.parse import parse_qs
 import cv2
 import numpy as np
 
-from relit.capture.corrections import corrected_masks, corrected_sphere, forget_mask, save_mask, save_sphere, sphere_from_boxes
+from relit.capture.corrections import (
+    corrected_masks,
+    corrected_sphere,
+    forget_mask,
+    save_mask,
+    save_sphere,
+    sphere_from_boxes,
+)
 from relit.errors import UserError
 from relit.images import encode_jpeg
 from relit.images.opencv import decode_bytes
@@ -22,10 +30,13 @@ SIDE = 1280  # pixels, longest side of what is painted on
 
 
 def correction_server(capture: Capture, port: int = 0) -> Server:
-    """A server of the page for this capture; what is saved there counts when the capture is opened the next time."""
+    """A server of the page for this capture; what is saved there counts when the capture is opened
+    the next time."""
     photos = (*capture.photos, *capture.held_out)
     root = capture.folder
-    may_cut = capture.kind != "duplicates"  # one box knows one object, and the mask of a pile is of all
+    may_cut = (
+        capture.kind != "duplicates"
+    )  # one box knows one object, and the mask of a pile is of all
 
     def index(query: str) -> Photo:
         i = int(parse_qs(query)["i"][0])
@@ -35,12 +46,28 @@ def correction_server(capture: Capture, port: int = 0) -> Server:
 
     def state() -> dict:
         done = corrected_masks(root)
-        listed = [{"name": p.name, "corrected": p.name in done, **dict(zip(("w", "h"), _size(p), strict=True))} for p in photos]
+        listed = [
+            {
+                "name": p.name,
+                "corrected": p.name in done,
+                **dict(zip(("w", "h"), _size(p), strict=True)),
+            }
+            for p in photos
+        ]
         sphere = corrected_sphere(root) or capture.sphere
-        circles = [_circle(p, sphere) for p in photos] if sphere is not None else [None] * len(photos)
+        circles = (
+            [_circle(p, sphere) for p in photos] if sphere is not None else [None] * len(photos)
+        )
         facts = [f"{len(photos)} photos", capture.format]
         offered = {"boxes": capture.has_cameras, "cut": may_cut}
-        return {"mode": "edit", "title": root.name, "facts": facts, "photos": listed, "circles": circles, **offered}
+        return {
+            "mode": "edit",
+            "title": root.name,
+            "facts": facts,
+            "photos": listed,
+            "circles": circles,
+            **offered,
+        }
 
     def photo(query: str) -> tuple[bytes, str]:
         return encode_jpeg(shrunk(index(query).load().rgb, SIDE)), "image/jpeg"
@@ -62,10 +89,17 @@ def correction_server(capture: Capture, port: int = 0) -> Server:
             p = index(f"i={int(entry['i'])}")
             if p.camera is None:
                 raise UserError(
-                    "boxes need cameras", "without them a box says nothing about the place", "reconstruct first, or give cameras"
+                    "boxes need cameras",
+                    "without them a box says nothing about the place",
+                    "reconstruct first, or give cameras",
                 )
             w, h = _size(p)
-            x0, y0, x1, y1 = (float(v) * s for v, s in zip(entry["box"], (p.camera.width / w, p.camera.height / h) * 2, strict=True))
+            x0, y0, x1, y1 = (
+                float(v) * s
+                for v, s in zip(
+                    entry["box"], (p.camera.width / w, p.camera.height / h) * 2, strict=True
+                )
+            )
             boxes.append((p.camera, (x0, y0, x1, y1)))
         sphere = sphere_from_boxes(boxes)
         save_sphere(root, sphere)
@@ -75,25 +109,39 @@ def correction_server(capture: Capture, port: int = 0) -> Server:
         entry = json.loads(body)
         p = index(f"i={int(entry['i'])}")
         if not may_cut:
-            raise UserError("a pile has no single box", "its mask shows all objects", "paint, or change the label image")
+            raise UserError(
+                "a pile has no single box",
+                "its mask shows all objects",
+                "paint, or change the label image",
+            )
         save_mask(root, p, mask_in_box(p, entry["box"]))
         return {"corrected": True}
 
-    posts, pictures = {"mask": keep_mask, "boxes": keep_boxes, "cut": keep_cut}, {"photo.jpg": photo, "mask.png": mask}
+    posts, pictures = (
+        {"mask": keep_mask, "boxes": keep_boxes, "cut": keep_cut},
+        {"photo.jpg": photo, "mask.png": mask},
+    )
     return open_port(lambda: Server(root, {"manifest.json": state}, posts, pictures, port), port)
 
 
 def mask_in_box(p: Photo, box: list) -> np.ndarray:
-    """(H, W) in [0, 1]: what GrabCut finds in a box (x0, y0, x1, y1), pixels of what is painted on. Raises UserError."""
+    """(H, W) in [0, 1]: what GrabCut finds in a box (x0, y0, x1, y1), pixels of what is painted on.
+    Raises UserError."""
     w, h = _size(p)
     x0, y0, x1, y1 = np.clip([float(v) for v in box], 0, (w, h, w, h))
     if not (min(x1 - x0, y1 - y0) >= 4 and (x1 - x0) * (y1 - y0) < 0.98 * w * h):
         raise UserError(
-            "the box is too small, or holds the whole photo", "what lies outside tells what is not the object", "draw it closely round it"
+            "the box is too small, or holds the whole photo",
+            "what lies outside tells what is not the object",
+            "draw it closely round it",
         )
     mask = box_cut(shrunk(p.load().rgb, SIDE), (x0, y0, x1, y1))
     if not mask.any():
-        raise UserError("nothing stands out in the box", "object and surroundings have the same colours", "paint the mask")
+        raise UserError(
+            "nothing stands out in the box",
+            "object and surroundings have the same colours",
+            "paint the mask",
+        )
     return mask
 
 
@@ -112,7 +160,8 @@ def _circle(p: Photo, sphere) -> list[float] | None:
 
 
 def _mask_of(p: Photo, root: Path) -> np.ndarray:
-    """The present mask at the size that is painted on: the corrected one, else the photo's own, else white."""
+    """The present mask at the size that is painted on: the corrected one, else the photo's own,
+    else white."""
     from relit.images import read_data
 
     path = corrected_masks(root).get(p.name)
@@ -132,10 +181,14 @@ def _png(mask: np.ndarray) -> bytes:
 
 
 def _decoded(body: bytes, size: tuple[int, int]) -> np.ndarray:
-    """A posted PNG as (h, w) in [0, 1]. Raises UserError for anything but a PNG of the size that was sent."""
+    """A posted PNG as (h, w) in [0, 1]. Raises UserError for anything but a PNG of the size that
+    was sent."""
     w, h = size
     head = body[:8] == b"\x89PNG\r\n\x1a\n" and len(body) > 24
-    if not head or (int.from_bytes(body[16:20], "big"), int.from_bytes(body[20:24], "big")) != (w, h):
+    if not head or (int.from_bytes(body[16:20], "big"), int.from_bytes(body[20:24], "big")) != (
+        w,
+        h,
+    ):
         raise UserError(f"the mask is no PNG of {w} x {h} pixels")
     mask = decode_bytes(body, cv2.IMREAD_GRAYSCALE)
     if mask is None:

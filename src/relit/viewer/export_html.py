@@ -1,4 +1,5 @@
-"""`relit export --format html`: the page with the asset inside, one file that opens from an e-mail and fetches nothing."""
+"""`relit export --format html`: the page with the asset inside, one file that opens from an e-mail
+and fetches nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +10,13 @@ from relit.files import disk_errors, write_text
 from relit.viewer.manifest import manifest
 from relit.viewer.page import page_with
 
-TYPES = {".glb": "model/gltf-binary", ".exr": "image/x-exr", ".hdr": "image/vnd.radiance", ".jpg": "image/jpeg", ".png": "image/png"}
+TYPES = {
+    ".glb": "model/gltf-binary",
+    ".exr": "image/x-exr",
+    ".hdr": "image/vnd.radiance",
+    ".jpg": "image/jpeg",
+    ".png": "image/png",
+}
 
 
 def data_uri(path: Path) -> str:
@@ -18,7 +25,8 @@ def data_uri(path: Path) -> str:
 
 
 def export_html(run: str | Path, out: str | Path, *, photos: bool = True) -> Path:
-    """Write the page of a finished run as one file. photos: with the small copies of the photos. Returns the file."""
+    """Write the page of a finished run as one file. photos: with the small copies of the photos.
+    Returns the file."""
     out = Path(out)
     from relit.asset.asset import find_asset
 

@@ -1,4 +1,5 @@
-"""What the page is told about a run: one JSON object, with addresses of files or with the files themselves as data URIs."""
+"""What the page is told about a run: one JSON object, with addresses of files or with the files
+themselves as data URIs."""
 
 from __future__ import annotations
 
@@ -22,9 +23,11 @@ Address = Callable[[Path], str]
 
 
 def manifest(run: Path, address: Address, *, live: bool, photos: bool = True) -> dict:
-    """What viewer/src/main.js reads. run: run folder or asset folder. address: path of a file -> what the page fetches.
+    """What viewer/src/main.js reads. run: run folder or asset folder. address: path of a file ->
+    what the page fetches.
 
-    live: the page asks `status.json` from time to time. photos: with the small copies of the photos.
+    live: the page asks `status.json` from time to time. photos: with the small copies of the
+    photos.
     Raises UserError for a folder that is neither a run nor an asset, or whose asset is damaged.
     """
     run = Path(run)
@@ -33,24 +36,51 @@ def manifest(run: Path, address: Address, *, live: bool, photos: bool = True) ->
         find_asset(run)  # says what was looked for
     config = _config(run)
     found = {} if asset is None else read_json(asset / "asset.json")
-    facts = [str(v) for v in (found.get("capture", config.get("capture")), found.get("quality", config.get("quality"))) if v]
+    facts = [
+        str(v)
+        for v in (
+            found.get("capture", config.get("capture")),
+            found.get("quality", config.get("quality")),
+        )
+        if v
+    ]
     if isinstance(found.get("seconds"), (int, float)):
         facts.append(readable_seconds(found["seconds"]))
-    out: dict = {"title": str(config.get("input") or run.resolve().name), "facts": facts, "live": live}
+    out: dict = {
+        "title": str(config.get("input") or run.resolve().name),
+        "facts": facts,
+        "live": live,
+    }
     out |= {"lights": [], "cameras": [], "asset": None}
     if asset is None:
         return out
     matrix = found.get("world_from_asset")
     if not _is_matrix(matrix):
-        raise UserError("world_from_asset in asset.json cannot be used", "it is no 4 x 4 matrix", f"reconstruct again: {asset}")
+        raise UserError(
+            "world_from_asset in asset.json cannot be used",
+            "it is no 4 x 4 matrix",
+            f"reconstruct again: {asset}",
+        )
     if not (asset / "object.glb").is_file():
-        raise UserError("the asset has no object.glb", "the folder is damaged", f"reconstruct again: {asset}")
+        raise UserError(
+            "the asset has no object.glb", "the folder is damaged", f"reconstruct again: {asset}"
+        )
     instances = _instances(asset)
-    out["asset"] = {"glb": address(asset / "object.glb"), "world_from_asset": matrix, "instances": instances}
+    out["asset"] = {
+        "glb": address(asset / "object.glb"),
+        "world_from_asset": matrix,
+        "instances": instances,
+    }
     copies = photo_files(run) if photos else {}
     cameras = read_cameras(asset / "cameras.json") if (asset / "cameras.json").is_file() else ()
     for name, camera in cameras:
-        out["cameras"].append({"name": name, "photo": address(copies[name]) if name in copies else None, **_frame(camera)})
+        out["cameras"].append(
+            {
+                "name": name,
+                "photo": address(copies[name]) if name in copies else None,
+                **_frame(camera),
+            }
+        )
     out["lights"] = _lights(asset, cameras, address)
     flash = read_small_json(asset / "lights" / "flash.json")
     if isinstance(flash, dict) and {"offset", "intensity"} <= flash.keys():
@@ -84,12 +114,22 @@ def _is_matrix(m) -> bool:
     return (
         isinstance(m, list)
         and len(m) == 4
-        and all(isinstance(r, list) and len(r) == 4 and all(isinstance(x, (int, float)) for x in r) for r in m)
+        and all(
+            isinstance(r, list) and len(r) == 4 and all(isinstance(x, (int, float)) for x in r)
+            for r in m
+        )
     )
 
 
 def _frame(camera: Camera) -> dict:
-    size = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    size = {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }
     return {**size, "transform_matrix": world_from_gl_camera(camera.world_from_camera).tolist()}
 
 
@@ -98,7 +138,9 @@ def _lights(asset: Path, cameras, address: Address) -> list[dict]:
     for suffix in ("exr", "hdr"):
         path = asset / "lights" / f"environment.{suffix}"
         if path.is_file():
-            out.append({"name": "recovered", "file": path.name, "url": address(path), "photo": None})
+            out.append(
+                {"name": "recovered", "file": path.name, "url": address(path), "photo": None}
+            )
             break
     for i, (name, _) in enumerate(cameras):
         path = asset / "lights" / f"photo_{i:04d}.exr"
@@ -110,7 +152,11 @@ def _lights(asset: Path, cameras, address: Address) -> list[dict]:
 def _instances(asset: Path) -> list:
     data = read_small_json(asset / "instances.json")
     listed = data.get("instances", []) if isinstance(data, dict) else []
-    poses = [i.get("world_from_object") for i in listed if isinstance(i, dict) and i.get("registered", True)]
+    poses = [
+        i.get("world_from_object")
+        for i in listed
+        if isinstance(i, dict) and i.get("registered", True)
+    ]
     return [m for m in poses if _is_matrix(m)]
 
 
@@ -128,19 +174,24 @@ def status(run: Path, address: Address) -> dict:
         now = {key: last.get(key) for key in ("stage", "step", "of", "seconds")}
         if now["of"] and now["step"]:
             now["left"] = now["seconds"] * (now["of"] / now["step"] - 1)
-    previews = sorted((run / "previews").glob("*.jpg"), key=lambda p: p.stat().st_mtime, reverse=True)[:6]
+    previews = sorted(
+        (run / "previews").glob("*.jpg"), key=lambda p: p.stat().st_mtime, reverse=True
+    )[:6]
     return {
         "running": is_held(run),
         "asset": _asset(run) is not None,
         "stages": [{key: s.get(key) for key in ("name", "title", "seconds")} for s in stages],
         "now": now,
         "curves": curves(records),
-        "previews": [{"name": p.stem, "url": f"{address(p)}?{p.stat().st_mtime_ns}"} for p in previews],
+        "previews": [
+            {"name": p.stem, "url": f"{address(p)}?{p.stat().st_mtime_ns}"} for p in previews
+        ],
     }
 
 
 def curves(records: list[dict]) -> list[dict]:
-    """[{stage, name, points: [[step, value], ...]}] of at most CURVE_POINTS points each, in the order in which they appear."""
+    """[{stage, name, points: [[step, value], ...]}] of at most CURVE_POINTS points each, in the
+    order in which they appear."""
     found: dict[tuple[str, str], list] = {}
     for record in records:
         for key, value in record.items():

@@ -1,4 +1,5 @@
-"""Small copies of a run's photos, so that the page can lay photo and render over one another wherever the run folder is moved."""
+"""Small copies of a run's photos, so that the page can lay photo and render over one another
+wherever the run folder is moved."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ MOST = 300  # photos; of a larger capture every n-th
 
 
 def write_photos(run: str | Path, capture: Capture) -> Path:
-    """Write RUN/photos/: JPEGs of the photos as the fit sees them (undistorted, upright), and index.json with their names."""
+    """Write RUN/photos/: JPEGs of the photos as the fit sees them (undistorted, upright), and
+    index.json with their names."""
     folder = Path(run) / PHOTOS
     chosen = capture.photos[:: max(1, -(-len(capture.photos) // MOST))]
     with disk_errors(Path(run)):
@@ -39,4 +41,8 @@ def shrunk(rgb: np.ndarray, side: int = SIDE) -> np.ndarray:
     h, w = rgb.shape[:2]
     s = min(1.0, side / max(h, w))
     size = (max(1, round(w * s)), max(1, round(h * s)))
-    return rgb if s == 1 else cv2.resize(np.ascontiguousarray(rgb, np.float32), size, interpolation=cv2.INTER_AREA)
+    return (
+        rgb
+        if s == 1
+        else cv2.resize(np.ascontiguousarray(rgb, np.float32), size, interpolation=cv2.INTER_AREA)
+    )

@@ -1,4 +1,5 @@
-"""`relit quadrants PHOTOS`: the page, or the terminal, that asks where each photo of a collection was taken from: quadrants.json."""
+"""`relit quadrants PHOTOS`: the page, or the terminal, that asks where each photo of a collection
+was taken from: quadrants.json."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from urllib.parse import parse_qs
 
-from relit.capture.samurai import QUADRANTS, direction_of, quadrant_of
+from relit.capture.readers.samurai import QUADRANTS, direction_of, quadrant_of
 from relit.errors import UserError
 from relit.files import write_text
 from relit.images import encode_jpeg
@@ -22,8 +23,8 @@ EXPLAINED = "where did the camera stand? a left, d right, w above, s below, f in
 
 
 def answers_of(keys: str) -> list[str]:
-    """SAMURAI's three answers of typed keys, such as 'af': Center where no key of an axis was typed. Raises UserError for other keys,
-    for two sides of one axis, and for none at all."""
+    """SAMURAI's three answers of typed keys, such as 'af': Center where no key of an axis was
+    typed. Raises UserError for other keys, for two sides of one axis, and for none at all."""
     words = []
     for key in keys.replace(" ", "").lower():
         if key not in KEYS:
@@ -33,7 +34,10 @@ def answers_of(keys: str) -> list[str]:
     for axis in AXES:
         said = [w for w in axis if w in words]
         if len(said) > 1:
-            raise UserError(f"{said[0]} and {said[1]} contradict each other", fix="type one of them, or neither for the middle")
+            raise UserError(
+                f"{said[0]} and {said[1]} contradict each other",
+                fix="type one of them, or neither for the middle",
+            )
         out.append(said[0] if said else "Center")
     direction_of(out)  # refuses three times Center
     return out
@@ -45,7 +49,8 @@ def keys_of(answers: list[str]) -> str:
 
 
 def read_answers(root: Path) -> dict[str, list[str]]:
-    """The answers that are there: name of the file -> three words. Empty where there are none, or none that can be read."""
+    """The answers that are there: name of the file -> three words. Empty where there are none, or
+    none that can be read."""
     try:
         frames = json.loads((root / QUADRANTS).read_text(encoding="utf-8"))["frames"]
         return {Path(f["image_name"]).name: list(f["quadrant"]) for f in frames}
@@ -61,8 +66,10 @@ def write_answers(root: Path, answers: dict[str, list[str]]) -> Path:
 
 
 def guesses_of(run: str | Path) -> dict[str, list[str]]:
-    """What a run's recovered cameras would answer: name of the file -> three words. Without hints a run's frame is that of the photo that
-    it grew from, taken for the front: then the guesses are right up to one turn of the whole. Raises UserError."""
+    """What a run's recovered cameras would answer: name of the file -> three words. Without hints a
+    run's frame is that of the photo that
+    it grew from, taken for the front: then the guesses are right up to one turn of the whole.
+    Raises UserError."""
     from relit.asset.asset import find_asset, read_cameras
 
     cameras = read_cameras(find_asset(run) / "cameras.json")
@@ -70,7 +77,8 @@ def guesses_of(run: str | Path) -> dict[str, list[str]]:
 
 
 def in_order(capture: Capture) -> list[Photo]:
-    """All photos by their names, those that are set aside among the others: neighbours were mostly taken one after the other."""
+    """All photos by their names, those that are set aside among the others: neighbours were mostly
+    taken one after the other."""
     return sorted((*capture.photos, *capture.held_out), key=lambda p: p.name)
 
 
@@ -80,8 +88,8 @@ def ask_in_terminal(
     say: Callable[[str], None] = print,
     guesses: Mapping[str, list[str]] | None = None,
 ) -> Path:
-    """Ask for every photo that has no answer yet; an empty line takes the guess, or skips the photo where there is none; 'q' stops. Each
-    answer is saved at once."""
+    """Ask for every photo that has no answer yet; an empty line takes the guess, or skips the photo
+    where there is none; 'q' stops. Each answer is saved at once."""
     root, guesses = capture.folder, guesses or {}
     answers = read_answers(root)
     say(EXPLAINED)
@@ -110,14 +118,20 @@ def ask_in_terminal(
     return write_answers(root, answers)
 
 
-def quadrant_server(capture: Capture, port: int = 0, guesses: Mapping[str, list[str]] | None = None) -> Server:
-    """A server of the page; every answer is saved at once. guesses: shown as chosen, until Enter makes them answers."""
+def quadrant_server(
+    capture: Capture, port: int = 0, guesses: Mapping[str, list[str]] | None = None
+) -> Server:
+    """A server of the page; every answer is saved at once. guesses: shown as chosen, until Enter
+    makes them answers."""
     photos, root, guesses = in_order(capture), capture.folder, guesses or {}
 
     def state() -> dict:
         answers = read_answers(root)
         names = [(p.name, Path(p.name).name) for p in photos]
-        listed = [{"name": shown, "answer": answers.get(file), "guess": guesses.get(file)} for shown, file in names]
+        listed = [
+            {"name": shown, "answer": answers.get(file), "guess": guesses.get(file)}
+            for shown, file in names
+        ]
         return {"photos": listed, "explained": EXPLAINED}
 
     def photo(query: str) -> tuple[bytes, str]:
@@ -136,7 +150,10 @@ def quadrant_server(capture: Capture, port: int = 0, guesses: Mapping[str, list[
         write_answers(root, answers)
         return {"answer": answers[Path(photos[i].name).name], "done": len(answers)}
 
-    server = open_port(lambda: Server(root, {"quadrants": state}, {"answer": keep}, {"photo.jpg": photo}, port), port)
+    server = open_port(
+        lambda: Server(root, {"quadrants": state}, {"answer": keep}, {"photo.jpg": photo}, port),
+        port,
+    )
     server.page = PAGE.encode()
     return server
 

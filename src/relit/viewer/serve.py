@@ -1,7 +1,8 @@
 """The local server behind `relit view`: loopback only, one folder, no foreign hosts or origins.
 
-A page of another site can make a browser send requests to 127.0.0.1. Three checks keep it out: the Host header must name this
-machine's loopback (against DNS rebinding), an Origin header must be the server's own, and nothing is sent that allows other origins.
+A page of another site can make a browser send requests to 127.0.0.1. Three checks keep it out: the
+Host header must name this machine's loopback (against DNS rebinding), an Origin header must be the
+server's own, and nothing is sent that allows other origins.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ POLICY = (
 
 
 class Server(ThreadingHTTPServer):
-    """One folder on a loopback port. answers: {path: () -> JSON value}. posts: {path: (bytes, query) -> JSON value}. pictures:
-    {path: query -> (bytes, type)}."""
+    """One folder on a loopback port. answers: {path: () -> JSON value}. posts: {path: (bytes,
+    query) -> JSON value}. pictures: {path: query -> (bytes, type)}."""
 
     daemon_threads = True
 
@@ -41,7 +42,12 @@ class Server(ThreadingHTTPServer):
         pictures: dict[str, Callable] | None = None,
         port: int = 0,
     ):
-        self.root, self.answers, self.posts, self.pictures = Path(root).resolve(), answers, posts or {}, pictures or {}
+        self.root, self.answers, self.posts, self.pictures = (
+            Path(root).resolve(),
+            answers,
+            posts or {},
+            pictures or {},
+        )
         self.page = page_text().encode()
         super().__init__((LOOPBACK, port), Handler)
 
@@ -57,7 +63,8 @@ def address_of(root: Path) -> Callable[[Path], str]:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """GET / (the page), /NAME.json (answers), /files/PATH (below the root); POST to the server's `posts`."""
+    """GET / (the page), /NAME.json (answers), /files/PATH (below the root); POST to the server's
+    `posts`."""
 
     server: Server
     server_version, sys_version = "relit", ""
@@ -66,7 +73,9 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if not self._ours():
-            return self._refuse(HTTPStatus.FORBIDDEN, "requests from other hosts or pages are refused")
+            return self._refuse(
+                HTTPStatus.FORBIDDEN, "requests from other hosts or pages are refused"
+            )
         path = urlsplit(self.path).path
         if path == "/":
             return self._send(self.server.page, "text/html; charset=utf-8")
@@ -87,17 +96,24 @@ class Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         length = self.headers.get("Content-Length", "")
         act = self.server.posts.get(urlsplit(self.path).path.lstrip("/"))
-        own_page = self.headers.get("Origin") is not None  # browsers send it with every POST: others have no business here
+        own_page = (
+            self.headers.get("Origin") is not None
+        )  # browsers send it with every POST: others have no business here
         if not self._ours() or not own_page or act is None:
             return self._refuse(HTTPStatus.FORBIDDEN, "refused")
         if not length.isascii() or not length.isdigit() or int(length) > MAX_BODY:
-            return self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the body is too large or its length is missing")
+            return self._refuse(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                "the body is too large or its length is missing",
+            )
         body = self.rfile.read(int(length))
         return self._answer(lambda: act(body, urlsplit(self.path).query))
 
     def _ours(self) -> bool:
         port = self.server.server_address[1]
-        hosts = {f"{name}:{port}" for name in (LOOPBACK, "localhost")} | ({LOOPBACK, "localhost"} if port == 80 else set())
+        hosts = {f"{name}:{port}" for name in (LOOPBACK, "localhost")} | (
+            {LOOPBACK, "localhost"} if port == 80 else set()
+        )
         origin = self.headers.get("Origin")
         if self.headers.get_all("Host", []) not in [[h] for h in hosts]:
             return False
@@ -109,7 +125,11 @@ class Handler(BaseHTTPRequestHandler):
         try:
             text = json.dumps(act(), allow_nan=False)
         except UserError as error:
-            return self._send(json.dumps({"error": str(error)}).encode(), "application/json", HTTPStatus.UNPROCESSABLE_ENTITY)
+            return self._send(
+                json.dumps({"error": str(error)}).encode(),
+                "application/json",
+                HTTPStatus.UNPROCESSABLE_ENTITY,
+            )
         except (OSError, ValueError, LookupError, TypeError) as error:
             text = json.dumps({"error": f"{type(error).__name__}: {error}"})
             return self._send(text.encode(), "application/json", HTTPStatus.INTERNAL_SERVER_ERROR)
@@ -121,7 +141,9 @@ class Handler(BaseHTTPRequestHandler):
             return self._refuse(HTTPStatus.NOT_FOUND, "there is no such file")
         try:
             path = (root / name).resolve()
-            if not path.is_relative_to(root) or not path.is_file():  # symbolic links that lead out are refused as well
+            if (
+                not path.is_relative_to(root) or not path.is_file()
+            ):  # symbolic links that lead out are refused as well
                 return self._refuse(HTTPStatus.NOT_FOUND, "there is no such file")
             file = path.open("rb")
         except OSError:
@@ -163,12 +185,16 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def run_server(run: Path, port: int = 0) -> Server:
-    """A server of a run folder (or asset folder), not yet serving. Raises UserError for a folder that is neither, or a taken port."""
+    """A server of a run folder (or asset folder), not yet serving. Raises UserError for a folder
+    that is neither, or a taken port."""
     run = Path(run)
     address = address_of(run)
     live = (run / "config.toml").is_file()
     manifest(run, address, live=live)  # what is wrong with the folder is said before the page opens
-    answers = {"manifest.json": lambda: manifest(run, address, live=live), "status.json": lambda: status(run, address)}
+    answers = {
+        "manifest.json": lambda: manifest(run, address, live=live),
+        "status.json": lambda: status(run, address),
+    }
     return open_port(lambda: Server(run, answers, port=port), port)
 
 
@@ -178,7 +204,12 @@ def open_port(make: Callable[[], Server], port: int) -> Server:
         return make()
     except OSError as error:
         why = error.strerror or str(error)
-        raise UserError(f"port {port} cannot be used", why, "give another --port, or none", code=EXIT_ENVIRONMENT) from None
+        raise UserError(
+            f"port {port} cannot be used",
+            why,
+            "give another --port, or none",
+            code=EXIT_ENVIRONMENT,
+        ) from None
 
 
 def serve_until_stopped(server: Server, say: Callable[[str], None], browse: bool) -> None:

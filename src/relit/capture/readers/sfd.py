@@ -1,0 +1,364 @@
+"""Photos of several identical objects and where each of them is: SfD's folders, photos with label
+images, cut-outs, COCO, BOP.
+
+SfD          transforms_train.json and train/000_rgb.png, train/000_instance_seg.png (or
+             raw/000_rgb.png, raw/000_instance_seg.png)
+labels       NAME_labels.png, NAME_instance_seg.png or NAME_seg.png beside the photo NAME.*: one
+             grey level or colour for each object,
+             black for the rest
+cut-outs     cutouts/*.png beside the photo (of several photos: cutouts/NAME/*.png): RGBA pictures
+             of the photo's size, one for each object
+COCO         a .json with `images` and `annotations` (polygons or run lengths) beside the photo
+BOP          a scene's folder: scene_camera.json, scene_gt.json, rgb/, mask_visib/ or mask/; of
+             several objects the commonest
+
+Several photos with labels in one folder are photos of one pile: nothing stirs between them, and
+labels need not agree.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from relit.capture.corrections import corrected_labels
+from relit.capture.frames import check_max_side, image_folder, list_images, pose_from, read_json
+from relit.capture.labels import BOP_TRUTH, checked_labels, read_labels, which_objects
+from relit.capture.networks import Network, found_instances
+from relit.capture.photo import Decoder
+from relit.conventions import world_from_cv_camera
+from relit.errors import UserError
+from relit.images import EXTENSIONS, Header, read_header, read_image
+from relit.scene import Camera, Capture, Photo, Pixels
+
+SUFFIXES = ("_instance_seg", "_labels", "_instances", "_seg")
+SFD_NORMALS = "_normal_pretrain.png"  # SfD's: y up, z towards the camera
+CUTOUTS = ("cutouts", "cut-outs", "instances")
+FOCAL_GUESS = 1.2  # of the longer side, where neither the user nor the file tells
+MOST_PHOTOS = 12  # of one pile; of more, so many evenly spread
+
+
+@dataclass(frozen=True)
+class Source:
+    """What was found: the photo, where its labels are (a label image, a folder of cut-outs, a COCO
+    or BOP file), and the file with the cameras. more: (photo, labels) of the other photos of the
+    same pile."""
+
+    root: Path
+    photo: Path
+    labels: Path
+    cameras: Path | None = None
+    more: tuple[tuple[Path, Path], ...] = ()
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Adds the labels to what `load` returns. labels: (H, W) int32 at the decoded size. upward: the
+    file's normals have y up and z towards the camera."""
+
+    load: Callable[[], Pixels]
+    labels: np.ndarray
+    upward: bool = False
+
+    def __call__(self) -> Pixels:
+        pixels = self.load()
+        if self.upward and pixels.normal is not None:
+            pixels = replace(pixels, normal=pixels.normal * np.array([1, -1, -1], np.float32))
+        return replace(pixels, labels=self.labels, mask=(self.labels > 0).astype(np.float32))
+
+
+def recognise(path: Path) -> Source | None:
+    """The photos and their labels, or None where `path` is no photo of duplicates."""
+    if path.is_file():
+        labels = _labels_of(path) if path.suffix.lower() in EXTENSIONS else None
+        return None if labels is None else Source(path.parent, path, labels, _cameras(path.parent))
+    if not path.is_dir():
+        return None
+    if (path / BOP_TRUTH).is_file() and (path / "rgb").is_dir():
+        photos = [f for f in sorted((path / "rgb").iterdir()) if f.suffix.lower() in EXTENSIONS]
+        return (
+            _source(path, [(f, path / BOP_TRUTH) for f in photos], path / "scene_camera.json")
+            if photos
+            else None
+        )
+    for folder in (path / "train", path / "raw", path):
+        if folder.is_dir():
+            found = [
+                (f, labels)
+                for f in sorted(folder.iterdir())
+                if _is_photo(f) and (labels := _labels_of(f)) is not None
+            ]
+            if found:
+                return _source(path, found, _cameras(path))
+    return None
+
+
+def _source(root: Path, found: list[tuple[Path, Path]], cameras: Path | None) -> Source:
+    if len({labels for _, labels in found}) == 1 and found[0][1].is_dir():
+        found = found[:1]  # one folder of cut-outs is one photo's
+    if len(found) > MOST_PHOTOS:
+        found = [found[k] for k in np.linspace(0, len(found) - 1, MOST_PHOTOS).round().astype(int)]
+    return Source(root, *found[0], cameras, tuple(found[1:]))
+
+
+def _is_photo(file: Path) -> bool:
+    return file.suffix.lower() in EXTENSIONS and not file.stem.endswith(
+        (*SUFFIXES, "_mask", "_normal", "_normal_pretrain", "_depth")
+    )
+
+
+def _cameras(root: Path) -> Path | None:
+    return next(
+        (root / n for n in ("transforms_train.json", "transforms.json") if (root / n).is_file()),
+        None,
+    )
+
+
+def _labels_of(photo: Path) -> Path | None:
+    stem = photo.stem.removesuffix("_rgb")
+    for suffix in SUFFIXES:
+        for end in (".png", ".tif", ".tiff", ".bmp"):
+            if (file := photo.parent / f"{stem}{suffix}{end}").is_file():
+                return file
+    for name in CUTOUTS:
+        for folder in (photo.parent / name / stem, photo.parent / name):
+            if folder.is_dir() and any(folder.glob("*.png")):
+                return folder
+    for file in sorted(photo.parent.glob("*.json")):
+        if file.stat().st_size < 64 << 20 and _is_coco(file, photo):
+            return file
+    return None
+
+
+def _is_coco(file: Path, photo: Path) -> bool:
+    """Whether the file is COCO's and speaks of the photo (or of one picture only)."""
+    try:
+        data = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (ValueError, OSError, RecursionError):
+        return False
+    if (
+        not isinstance(data, dict)
+        or not isinstance(data.get("annotations"), list)
+        or not isinstance(data.get("images"), list)
+    ):
+        return False
+    names = {Path(str(i.get("file_name", ""))).name for i in data["images"] if isinstance(i, dict)}
+    others = [f for f in photo.parent.iterdir() if f.name in names]
+    return photo.name in names or not others
+
+
+def open_duplicates(
+    source: Source, *, focal: float | None = None, max_side: int | None = None
+) -> Capture:
+    """The capture: each photo with its camera and labels. focal: pixels of the photo as stored, or
+    None. Raises UserError (exit code 3)."""
+    notes: list[str] = []
+    photos, objects = [], 0
+    for path, labels in ((source.photo, source.labels), *source.more):
+        header = read_header(path)
+        own, dropped = usable_labels(
+            read_labels(labels, path, (header.height, header.width)), labels, source.root, path
+        )
+        named = f"{path.name}: " if source.more else ""
+        count = len(np.unique(own[own > 0]))
+        notes += [named + note for note in (*dropped, f"{count} objects in {labels.name}")]
+        objects += count
+        photos.append(labelled_photo(source, path, header, own, focal, max_side, notes))
+    if (told := which_objects(source.labels, source.photo)) is not None:
+        notes.append(told)
+    if source.more:
+        notes.append(f"{len(photos)} photos of one pile: nothing must stir between them")
+    return Capture(
+        source.root,
+        "duplicates",
+        tuple(photos),
+        notes=tuple(dict.fromkeys(notes)),
+        kind="duplicates",
+        objects=objects,
+    )
+
+
+def open_segmented(
+    path: Path, network: str, *, focal: float | None = None, max_side: int | None = None
+) -> Capture:
+    """As `open_duplicates` for a photo, or a folder of photos of one pile, whose labels an ONNX
+    network finds (`capture.networks`)."""
+    check_max_side(max_side)
+    files = [path]
+    if path.is_dir():
+        files = [f for f in list_images(image_folder(path) or path) if _is_photo(f)][:MOST_PHOTOS]
+    if not files or not files[0].is_file():
+        raise UserError("no photo was found", fix=f"give a photo or a folder of photos: {path}")
+    root = path if path.is_dir() else path.parent
+    source, notes, photos, objects = (
+        Source(root, files[0], Path(network), _cameras(root)),
+        [],
+        [],
+        0,
+    )
+    segmenter = Network(network)
+    for file in files:
+        labels, dropped = usable_labels(
+            found_instances(segmenter, read_image(file).rgb), file, root, file
+        )
+        count = len(np.unique(labels[labels > 0]))
+        notes += [
+            *dropped,
+            f"{file.name}: {count} objects found by {Path(network).name}; look at them",
+        ]
+        objects += count
+        photos.append(
+            labelled_photo(source, file, read_header(file), labels, focal, max_side, notes)
+        )
+    return Capture(
+        root,
+        "duplicates",
+        tuple(photos),
+        notes=tuple(dict.fromkeys(notes)),
+        kind="duplicates",
+        objects=objects,
+    )
+
+
+def usable_labels(
+    labels: np.ndarray, source: Path, root: Path, photo: Path
+) -> tuple[np.ndarray, list[str]]:
+    """Labels as `checked_labels` leaves them, corrected by hand where they were
+    (`capture.corrections`), and notes about both."""
+    own, dropped = checked_labels(labels, source)
+    fixed, notes = corrected_labels(own, root, photo.relative_to(root).as_posix())
+    if notes:
+        own, dropped = checked_labels(np.where(own < 0, labels, fixed), source)
+    return own, [*dropped, *notes]
+
+
+def labelled_photo(
+    source: Source,
+    path: Path,
+    header: Header,
+    labels: np.ndarray,
+    focal: float | None,
+    max_side: int | None,
+    notes: list[str],
+) -> Photo:
+    """One photo with its camera and its labels (H, W); what was assumed goes to `notes`."""
+    w, h = header.width, header.height
+    pose, known, middle = np.eye(4), None, (w / 2, h / 2)
+    if source.cameras is not None and source.cameras.is_file():
+        pose, known, middle = (
+            _bop_camera if source.cameras.name == "scene_camera.json" else _camera
+        )(source.cameras, path, w, h)
+    if focal is None and known is None:
+        focal = header.focal
+        if focal is None:
+            focal = FOCAL_GUESS * max(w, h)
+            notes.append(
+                f"the focal length is not known; {focal:.0f} pixels are assumed (--focal PIXELS): shapes come out too flat or too deep"
+            )
+    f = float(focal if focal is not None else known)
+    scale = min(1.0, (max_side or max(w, h)) / max(w, h))
+    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    camera = Camera(w, h, f, f, *middle, pose).resized(*size)
+    labels = labels if scale == 1 else cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    stem = path.stem.removesuffix("_rgb")
+    normal = next(
+        (
+            p
+            for end in ("_normal.png", "_normal.exr", SFD_NORMALS)
+            if (p := path.with_name(stem + end)).is_file()
+        ),
+        None,
+    )
+    upward = normal is not None and normal.name.endswith(SFD_NORMALS)
+    load = Labelled(
+        Decoder(path, size, normal=normal, orientation=header.orientation),
+        labels.astype(np.int32),
+        upward,
+    )
+    if normal is not None:
+        notes.append(f"normal priors in {normal.name}")
+    return Photo(
+        path.relative_to(source.root).as_posix(),
+        load,
+        *size,
+        camera=camera,
+        focal_hint=header.focal,
+    )
+
+
+def _camera(
+    file: Path, photo: Path, width: int, height: int
+) -> tuple[np.ndarray, float | None, tuple[float, float]]:
+    """(world_from_camera, focal in pixels or None, principal point) of the photo's frame, or of the
+    first where none is named like it. SfD writes the focal length as text."""
+    data = read_json(file)
+    frames = (
+        [f for f in data.get("frames") or [] if isinstance(f, dict)]
+        if isinstance(data.get("frames"), list)
+        else []
+    )
+    stem = photo.stem.removesuffix("_rgb")
+    frame = next(
+        (f for f in frames if Path(str(f.get("file_path", ""))).stem.removesuffix("_rgb") == stem),
+        frames[0] if frames else {},
+    )
+    pose = (
+        world_from_cv_camera(pose_from(frame["transform_matrix"], "the camera", file))
+        if "transform_matrix" in frame
+        else np.eye(4)
+    )
+
+    def number(key: str) -> float | None:
+        value = frame.get(key, data.get(key))
+        if value is None:
+            return None
+        try:
+            out = float(value)
+        except (TypeError, ValueError, OverflowError):
+            out = -1.0
+        if not 0 < out < 1e6:
+            raise UserError(
+                f"'{key}' is no focal length, size or principal point: {value!r}",
+                fix=f"write a number of pixels: {file}",
+            )
+        return out
+
+    sx, sy = (
+        size / given if (given := number(key)) else 1.0
+        for key, size in (("w", width), ("h", height))
+    )
+    cx, cy = number("cx"), number("cy")
+    middle = (width / 2 if cx is None else cx * sx, height / 2 if cy is None else cy * sy)
+    for key in ("focal", "fl_x", "camera_angle_x"):
+        value = number(key)
+        if value is not None:
+            return (
+                pose,
+                width / (2 * np.tan(value / 2)) if key == "camera_angle_x" else value * sx,
+                middle,
+            )
+    return pose, None, middle
+
+
+def _bop_camera(
+    file: Path, photo: Path, width: int, height: int
+) -> tuple[np.ndarray, float | None, tuple[float, float]]:
+    """As `_camera`, from BOP's cam_K; the world is the camera's frame (millimetres do not
+    matter)."""
+    try:
+        k = np.array(read_json(file)[str(int(photo.stem))]["cam_K"], np.float64).reshape(3, 3)
+        if not (np.isfinite(k).all() and k[0, 0] > 0):
+            raise ValueError("cam_K makes no sense")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise UserError(
+            "scene_camera.json is not as BOP writes it",
+            f"{type(error).__name__}: {error}",
+            f"see: {file}",
+        ) from None
+    # BOP counts pixel centres as whole numbers
+    return np.eye(4), float((k[0, 0] + k[1, 1]) / 2), (float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)

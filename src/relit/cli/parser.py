@@ -1,0 +1,214 @@
+"""The parser of one verb: argparse whose complaints are answers, and the flags that several verbs
+share."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from relit.errors import EXIT_USAGE, UserError, did_you_mean
+
+QUALITIES = ("draft", "standard", "high")
+DEVICES = ("auto", "cpu", "cuda")
+KINDS = ("multiview", "flash", "duplicates", "collection")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a verb does for one kind of capture. flags: adds the kind's own flags to the verb's
+    parser. act: does it."""
+
+    flags: Callable[[Parser], None]
+    act: Callable[[argparse.Namespace], int | None]
+
+
+@dataclass(frozen=True)
+class Verb:
+    """summary: one line for the overview. flags: adds arguments to a parser (common ones to the
+    first group). act: does it.
+    kinds: for a verb whose first positional names a kind of capture, what each kind adds."""
+
+    summary: str
+    flags: Callable[[Parser], None]
+    act: Callable[[argparse.Namespace], int | None]
+    kinds: Mapping[str, Kind] = field(default_factory=dict)
+
+    def kind_in(self, argv: Sequence[str]) -> str:
+        """The kind that the words after the verb name: the first of them that is one and does not
+        follow a flag; else the first kind."""
+        for before, word in zip(("", *argv), argv, strict=False):
+            if word in self.kinds and (not before.startswith("-") or "=" in before):
+                return word
+        return next(iter(self.kinds))
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse whose complaints are UserErrors with a suggestion; `common` and `more` are the two
+    groups of the help."""
+
+    def __init__(self, verb: str, summary: str):
+        super().__init__(prog=f"relit {verb}", description=summary, allow_abbrev=False)
+        self.verb = verb
+        self.common = self.add_argument_group("common flags")
+        self.more = self.add_argument_group("more flags")
+
+    def parse(self, argv: list[str]) -> argparse.Namespace | None:
+        """Parsed arguments, or None when --help was asked and answered."""
+        if "-h" in argv or "--help" in argv:
+            self.print_help()
+            return None
+        argv = self._joined(argv)
+        known = {o for a in self._actions for o in a.option_strings}
+        for word in argv:
+            if word.startswith("--") and word.split("=")[0] not in known:
+                self._refuse(word)
+        args, left = self.parse_known_args(argv)
+        if left:
+            self._refuse(left[0])
+        return args
+
+    def _joined(self, argv: list[str]) -> list[str]:
+        """A value that begins with a minus and a digit is joined to its flag: argparse would take
+        it for a flag."""
+        taking = {
+            o
+            for a in self._actions
+            for o in a.option_strings
+            if o.startswith("--") and a.nargs is None
+        }
+        out: list[str] = []
+        for word in argv:
+            if out and out[-1] in taking and re.match(r"-[\d.]", word):
+                out[-1] += f"={word}"
+            else:
+                out.append(word)
+        return out
+
+    def error(self, message: str):
+        missing = re.match(r"the following arguments are required: (.*)", message)
+        what = f"missing: {missing.group(1)}" if missing else message
+        raise UserError(
+            f"relit {self.verb}: {what}", fix=f"relit {self.verb} --help", code=EXIT_USAGE
+        )
+
+    def _check_value(self, action, value) -> None:
+        if action.choices is not None and value not in action.choices:
+            name = action.option_strings[-1] if action.option_strings else action.dest
+            what = f"relit {self.verb}: {name} {value} is not known.{did_you_mean(str(value), action.choices)}"
+            raise UserError(what, f"one of: {', '.join(action.choices)}", code=EXIT_USAGE)
+
+    def _refuse(self, word: str):
+        flag = word.split("=")[0]
+        flags = [o for a in self._actions for o in a.option_strings if o.startswith("--")]
+        if word.startswith("-"):
+            what = f"relit {self.verb}: unknown flag '{flag}'.{did_you_mean(flag, flags)}"
+        else:
+            what = f"relit {self.verb}: unexpected '{word}'; there is one input"
+        raise UserError(what, fix=f"relit {self.verb} --help", code=EXIT_USAGE)
+
+
+def path_in(parser: Parser, name: str, text: str) -> None:
+    parser.add_argument(name, type=Path, help=text)
+
+
+def out_flag(parser: Parser, text: str, default: Path | None = None) -> None:
+    parser.common.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        required=default is None,
+        default=default,
+        metavar="PATH",
+        help=text,
+    )
+
+
+def job_flags(parser: Parser, quality: str | None) -> None:
+    add = parser.common.add_argument
+    add(
+        "--quality",
+        choices=QUALITIES,
+        default=quality,
+        help="draft (about a minute), standard (default) or high",
+    )
+    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    add(
+        "--seed",
+        type=int,
+        default=None,
+        help="same seed, same result within tolerance on the CPU (default 0)",
+    )
+
+
+def capture_flag(parser: Parser) -> None:
+    parser.common.add_argument(
+        "--capture",
+        choices=("auto", *KINDS),
+        default=None,
+        help="what kind of photos (default auto)",
+    )
+
+
+OPENING = (
+    "masks",
+    "sphere",
+    "max_side",
+    "focal",
+)  # what `opening_flags` give, fields of `relit.job.Job`
+
+
+def opening_flags(parser: Parser) -> None:
+    """Flags that say how the input is to be read."""
+    add = parser.more.add_argument
+    add(
+        "--masks",
+        default=None,
+        metavar="HOW",
+        help="auto (default), none, alpha, files, threshold, grabcut, segment[:NETWORK]",
+    )
+    add(
+        "--sphere",
+        type=sphere,
+        default=None,
+        metavar="X,Y,Z,R",
+        help="ball that holds the object, in the frame and unit of the cameras",
+    )
+    add(
+        "--max-side",
+        type=int,
+        default=None,
+        metavar="PIXELS",
+        help="shrink photos whose longer side is longer",
+    )
+    add(
+        "--focal",
+        type=float,
+        default=None,
+        metavar="PIXELS",
+        help="known focal length, for photos without cameras",
+    )
+
+
+def sphere(text: str) -> tuple[float, ...]:
+    parts = text.split(",")
+    try:
+        values = tuple(float(p) for p in parts)
+    except ValueError:
+        values = ()
+    if len(values) != 4 or not values[3] > 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not X,Y,Z,RADIUS")
+    return values
+
+
+def free(path: Path, overwrite: bool) -> None:
+    """Nothing is overwritten silently: refuse an existing file or a folder with something in it."""
+    taken = path.is_file() or (path.is_dir() and any(path.iterdir()))
+    if taken and not overwrite:
+        raise UserError(
+            "the output is there already; nothing was overwritten",
+            fix=f"give another -o, or --overwrite: {path}",
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,291 @@
+"""synthesize: one entry of SYNTHESIZERS for each kind of capture that can be rendered, with its own
+flags.
+
+A new kind adds a flags function, an act and its entry here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from relit.cli.parser import DEVICES, KINDS, Kind, Parser, out_flag
+from relit.errors import EXIT_USAGE, UserError
+
+
+def synthesize_flags(parser: Parser) -> None:
+    """What every kind takes."""
+    parser.add_argument(
+        "kind",
+        choices=KINDS,
+        help="kind of capture; each has flags of its own: relit synthesize KIND --help",
+    )
+    add = parser.common.add_argument
+    add("--asset", required=True, type=Path, metavar="FILE", help=".glb, .gltf or .obj")
+    out_flag(parser, "folder to write")
+    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    more = parser.more.add_argument
+    more("--seed", type=int, default=0, help="default 0")
+    more("--roughness", type=float, default=None, help="constant instead of the file's map")
+    more("--metallic", type=float, default=None, help="constant instead of the file's map")
+
+
+def do_synthesize(args) -> None:
+    SYNTHESIZERS[args.kind].act(args)
+    print(args.out)
+
+
+def sampling_flags(
+    parser: Parser, *, views: int, test_views: int, resolution: int, spp: int, test_spp: int
+) -> None:
+    """How many pictures of what size; the arguments are the defaults."""
+    add, more = parser.common.add_argument, parser.more.add_argument
+    add("--views", type=int, default=views, help=f"training photos (default {views})")
+    add("--test-views", type=int, default=test_views, help=f"test photos (default {test_views})")
+    more("--resolution", type=int, default=resolution, help=f"pixels a side (default {resolution})")
+    more("--spp", type=int, default=spp, help=f"samples a pixel of training photos (default {spp})")
+    more(
+        "--test-spp",
+        type=int,
+        default=test_spp,
+        help=f"samples a pixel of what is measured against (default {test_spp})",
+    )
+
+
+# ---------------------------------------------------------------- multiview
+
+
+def multiview_flags(parser: Parser) -> None:
+    add = parser.common.add_argument
+    add(
+        "--light", required=True, type=Path, nargs="+", metavar="FILE", help="lat-long .hdr or .exr"
+    )
+    add(
+        "--relight",
+        type=Path,
+        nargs="*",
+        default=[],
+        metavar="FILE",
+        help="other lights, for the truth of relighting",
+    )
+    sampling_flags(parser, views=60, test_views=12, resolution=400, spp=64, test_spp=256)
+
+
+def multiview(args) -> None:
+    if len(args.light) != 1:
+        raise UserError(
+            "a multiview capture has one light",
+            fix="give one file to --light; others go to --relight",
+            code=EXIT_USAGE,
+        )
+    from relit.device import use_device
+    from relit.log import Log
+    from relit.synthesize.multiview import synthesize_multiview
+
+    use_device(args.device)
+    synthesize_multiview(
+        args.asset,
+        args.light[0],
+        args.out,
+        views=args.views,
+        test_views=args.test_views,
+        relights=args.relight,
+        resolution=args.resolution,
+        spp=args.spp,
+        test_spp=args.test_spp,
+        seed=args.seed,
+        roughness=args.roughness,
+        metallic=args.metallic,
+        say=Log().say,
+    )
+
+
+# ---------------------------------------------------------------- flash
+
+
+def flash_flags(parser: Parser) -> None:
+    more = parser.more.add_argument
+    sampling_flags(parser, views=120, test_views=20, resolution=400, spp=64, test_spp=256)
+    more(
+        "--node",
+        nargs="*",
+        default=[],
+        metavar="NAME",
+        help="only these nodes of a .glb (default: all)",
+    )
+    more(
+        "--flash-offset",
+        type=float,
+        nargs=3,
+        default=None,
+        metavar=("X", "Y", "Z"),
+        help="of the flash, right, down, forward (default -.11 -.06 0)",
+    )
+    more("--png", action="store_true", help="photos as 8-bit PNG instead of linear EXR")
+
+
+def flash(args) -> None:
+    if args.roughness is not None or args.metallic is not None:
+        raise UserError(
+            "a flash capture's roughness is made with the object",
+            fix="leave out --roughness and --metallic",
+            code=EXIT_USAGE,
+        )
+    from relit.device import use_device
+    from relit.log import Log
+    from relit.synthesize.flash import OFFSET, synthesize_flash
+
+    use_device(args.device)
+    synthesize_flash(
+        args.asset,
+        (),
+        args.out,
+        views=args.views,
+        test_views=args.test_views,
+        nodes=args.node,
+        resolution=args.resolution,
+        spp=args.spp,
+        test_spp=args.test_spp,
+        seed=args.seed,
+        offset=args.flash_offset or OFFSET,
+        png=args.png,
+        say=Log().say,
+    )
+
+
+# ---------------------------------------------------------------- collection
+
+
+def collection_flags(parser: Parser) -> None:
+    add = parser.common.add_argument
+    add(
+        "--light",
+        required=True,
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="lat-long .hdr or .exr; each photo takes one",
+    )
+    sampling_flags(parser, views=60, test_views=6, resolution=400, spp=48, test_spp=192)
+    more = parser.more.add_argument
+    more(
+        "--rough-masks",
+        type=float,
+        default=1.0,
+        metavar="PIXELS",
+        help="outlines of masks wander so far (default 1)",
+    )
+
+
+def collection(args) -> None:
+    from relit.device import use_device
+    from relit.log import Log
+    from relit.synthesize.collection import synthesize_collection
+
+    use_device(args.device)
+    synthesize_collection(
+        args.asset,
+        args.light,
+        args.out,
+        views=args.views,
+        test_views=args.test_views,
+        resolution=args.resolution,
+        spp=args.spp,
+        test_spp=args.test_spp,
+        seed=args.seed,
+        roughness=args.roughness,
+        metallic=args.metallic,
+        rough_masks=args.rough_masks,
+        say=Log().say,
+    )
+
+
+# ---------------------------------------------------------------- duplicates
+
+
+def duplicates_flags(parser: Parser) -> None:
+    add, more = parser.common.add_argument, parser.more.add_argument
+    add(
+        "--light", required=True, type=Path, nargs="+", metavar="FILE", help="lat-long .hdr or .exr"
+    )
+    add(
+        "--relight",
+        type=Path,
+        nargs="*",
+        default=[],
+        metavar="FILE",
+        help="other lights, for the truth of relighting",
+    )
+    add("--count", type=int, default=10, help="objects in the photo (default 10)")
+    add("--photos", type=int, default=1, help="photos of the pile (default 1)")
+    add("--test-views", type=int, default=8, help="novel views of the pile (default 8)")
+    more("--resolution", type=int, default=1600, help="pixels a side of the photo (default 1600)")
+    more(
+        "--test-resolution",
+        type=int,
+        default=400,
+        help="pixels a side of the novel views (default 400)",
+    )
+    more("--spp", type=int, default=64, help="samples a pixel of the photo (default 64)")
+    more(
+        "--test-spp",
+        type=int,
+        default=128,
+        help="samples a pixel of what is measured against (default 128)",
+    )
+    more(
+        "--lean",
+        type=float,
+        default=12.0,
+        metavar="DEGREES",
+        help="standard deviation of the tilt away from the resting pose (default 12)",
+    )
+    more("--spread", type=float, default=1.0, help="factor on the radius of the pile (default 1)")
+    more(
+        "--node",
+        nargs="*",
+        default=[],
+        metavar="NAME",
+        help="only these nodes of a .glb (default: all)",
+    )
+
+
+def duplicates(args) -> None:
+    if len(args.light) != 1:
+        raise UserError(
+            "a photo has one light",
+            fix="give one file to --light; others go to --relight",
+            code=EXIT_USAGE,
+        )
+    from relit.device import use_device
+    from relit.log import Log
+    from relit.synthesize.duplicates import synthesize_duplicates
+
+    use_device(args.device)
+    synthesize_duplicates(
+        args.asset,
+        args.light[0],
+        args.out,
+        count=args.count,
+        photos=args.photos,
+        test_views=args.test_views,
+        relights=args.relight,
+        resolution=args.resolution,
+        test_resolution=args.test_resolution,
+        spp=args.spp,
+        test_spp=args.test_spp,
+        seed=args.seed,
+        lean=args.lean,
+        spread=args.spread,
+        nodes=args.node,
+        roughness=args.roughness,
+        metallic=args.metallic,
+        say=Log().say,
+    )
+
+
+SYNTHESIZERS: dict[str, Kind] = {
+    "multiview": Kind(multiview_flags, multiview),
+    "flash": Kind(flash_flags, flash),
+    "collection": Kind(collection_flags, collection),
+    "duplicates": Kind(duplicates_flags, duplicates),
+}

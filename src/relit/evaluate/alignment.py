@@ -1,0 +1,118 @@
+"""Bring a reconstruction into the frame of the truth: Sim(3) from matched cameras, and what is left
+of their poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from relit.conventions import move_pose, rotate_environment, scale_of
+from relit.errors import UserError
+from relit.geometry import se3
+from relit.scene import Asset, Camera, Flash
+
+
+def umeyama(source, target, with_scale: bool = True) -> np.ndarray:
+    """Least-squares similarity (4, 4) target_from_source of matched points (N, 3); Umeyama 1991,
+    Eqs. 34-43.
+
+    Raises UserError for fewer than 3 points or points on a line, where the rotation is not
+    determined.
+    """
+    x, y = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    if len(x) < 3:
+        raise UserError(
+            f"{len(x)} matched points cannot fix a similarity",
+            "at least 3 that are not on a line are needed",
+        )
+    d = np.linalg.svd((y - y.mean(0)).T @ (x - x.mean(0)) / len(x), compute_uv=False)
+    if d[1] < 1e-9 * max(d[0], 1e-30):
+        raise UserError(
+            "the matched points lie on a line", "the rotation around that line is not determined"
+        )
+    return se3.umeyama(x, y, with_scale)
+
+
+def align_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) -> np.ndarray:
+    """truth_from_recovered (4, 4) similarity from the cameras that both hold under one name.
+
+    Fitted on the camera centres together with one point ahead of each, at the mean distance of the
+    cameras from their common
+    centre: turntables and arcs, whose centres alone nearly lie in a line or plane, are well
+    determined that way.
+    """
+    names = sorted(set(recovered) & set(truth))
+    if not names:
+        raise UserError(
+            "no recovered camera has the name of a true one",
+            f"recovered: {', '.join(sorted(recovered)[:3])} ...; truth: {', '.join(sorted(truth)[:3])} ...",
+        )
+    a = np.array([recovered[n].world_from_camera for n in names])
+    b = np.array([truth[n].world_from_camera for n in names])
+    spread_a, spread_b = (
+        np.linalg.norm(m[:, :3, 3] - m[:, :3, 3].mean(0), axis=1).mean() for m in (a, b)
+    )
+    if len(names) < 2 or spread_a < 1e-12:
+        raise UserError(
+            f"{len(names)} matched cameras cannot fix a scale",
+            "at least 2 apart from each other are needed",
+        )
+    ahead_a = a[:, :3, 3] + a[:, :3, 2] * spread_a
+    ahead_b = b[:, :3, 3] + b[:, :3, 2] * spread_b
+    return umeyama(np.concatenate([a[:, :3, 3], ahead_a]), np.concatenate([b[:, :3, 3], ahead_b]))
+
+
+def rotation_angle(a, b) -> float:
+    """Angle in degrees between two rotations (3, 3)."""
+    return se3.rotation_angle(np.asarray(a, np.float64).T @ np.asarray(b, np.float64))
+
+
+def pose_errors(
+    recovered: dict[str, Camera], truth: dict[str, Camera], truth_from_recovered
+) -> tuple[np.ndarray, np.ndarray]:
+    """(rotation errors in degrees, distances between centres in world units) of the matched
+    cameras, sorted by name."""
+    rotations, distances = [], []
+    for name in sorted(set(recovered) & set(truth)):
+        moved = move_pose(truth_from_recovered, recovered[name].world_from_camera)
+        rotations.append(rotation_angle(moved[:3, :3], truth[name].world_from_camera[:3, :3]))
+        distances.append(float(np.linalg.norm(moved[:3, 3] - truth[name].centre)))
+    return np.array(rotations), np.array(distances)
+
+
+def same_frame(recovered: dict[str, Camera], truth: dict[str, Camera]) -> bool:
+    """Whether the recovered cameras stand in the truth's frame already: median rotation under 5
+    degrees and median centre within 5 % of the cameras' mean distance from their middle. Cameras
+    that were given pass, refined or not; an SfM frame never does."""
+    names = set(recovered) & set(truth)
+    if not names:
+        return False
+    rotations, distances = pose_errors(recovered, truth, np.eye(4))
+    centres = np.array([truth[n].centre for n in names])
+    spread = np.linalg.norm(centres - centres.mean(0), axis=1).mean()
+    return bool(np.median(rotations) < 5.0 and np.median(distances) <= 0.05 * max(spread, 1e-12))
+
+
+def aligned(
+    asset: Asset, truth: dict[str, Camera], recovered: dict[str, Camera]
+) -> tuple[Asset, str]:
+    """The asset carried into the frame of the true cameras, and how: 'identity' when its cameras
+    stand there already (they were given) or it has none, 'sim3' when they were recovered from
+    photos and the frame is free."""
+    if not recovered or same_frame(recovered, truth):
+        return asset, "identity"
+    s = align_cameras(recovered, truth)
+    k = scale_of(s)
+    flash = (
+        None if asset.flash is None else Flash(asset.flash.offset * k, asset.flash.intensity * k**2)
+    )
+    environment = None if asset.environment is None else rotate_environment(asset.environment, s)
+    cameras = tuple(
+        (name, camera.with_pose(move_pose(s, camera.world_from_camera)))
+        for name, camera in asset.cameras
+    )
+    placed = s @ asset.world_from_asset
+    return replace(
+        asset, world_from_asset=placed, environment=environment, cameras=cameras, flash=flash
+    ), "sim3"

@@ -1,0 +1,337 @@
+"""Photos that stand against a finished model: those that were set aside, and those whose place was
+not found at first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from relit.fit.collection.options import CollectionOptions
+from relit.fit.collection.photos import Shot, crops_of
+from relit.fit.collection.surface import (
+    fit_collection_surface,
+    light_family,
+    light_options,
+    start_collection_surface,
+)
+from relit.fit.passes.optimiser import NoStage
+from relit.fit.passes.pixels import corrected, make_bank
+from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions
+from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume
+from relit.fit.registration.fine_detail import borne_out, detail_of, laid_on, surface_of, told_apart
+from relit.fit.registration.photos.framing import is_cut, slide
+from relit.fit.registration.photos.poses import COARSE, GREY, PARTS, SLACK, best_refined
+from relit.fit.registration.register import (
+    crop_rings,
+    directions_around,
+    hint_prior,
+    make_gallery,
+    near,
+    refine,
+    search,
+    views_from,
+    volume_render,
+)
+from relit.geometry.mesh import extract_mesh, vertex_areas
+from relit.geometry.sdf import dense_values
+from relit.geometry.se3 import rotation_angle
+from relit.lighting.per_photo import COLUMNS, ROWS
+from relit.materials.field import start_material
+from relit.rendering.appearance.light_per_photo import shade_photos, shade_plain, start_photo_lights
+from relit.rendering.transport import TraceableMesh
+from relit.run import run_arrays
+from relit.scene import Camera
+
+AGAIN = 600  # viewpoints that a finished model is looked at from
+CHOICES = 6  # places of each photo that are looked into
+ELSEWHERE = 20.0  # degrees: what is nearer is found by descent
+LONGER = (
+    3  # times `frozen_steps` that held-out photos descend: they have no further pass to arrive in
+)
+FAR = 30.0  # degrees from which on fine detail decides
+WORSE = 0.06  # by which the score of a place may be lower for fine detail to decide
+# by which another pose must score better than the present one: sides that look alike differ by .01
+# from light alone
+GAIN = 0.03
+
+
+def held_out_stage(
+    held,
+    shots,
+    model: VolumeModel,
+    mesh,
+    albedo,
+    maps,
+    cameras,
+    degrees,
+    run,
+    options: CollectionOptions,
+    seed: int,
+):
+    """(cameras, lights (H, ROWS, COLUMNS, 3)) of the held-out photos: registered by rendering and
+    by what the others (`shots`, their `cameras`) show, descended, lit; model and material stay."""
+    if not held:
+        return [], np.zeros((0, ROWS, COLUMNS, 3), np.float32)
+    if run.done("held_out"):
+        kept = run_arrays(run, "held_out", "photos")
+    else:
+        with run.stage(
+            "held_out", steps=options.frozen_steps, title="photos that were set aside"
+        ) as stage:
+            new = [replace(s, camera=with_median_field(s, cameras)) for s in held]
+            found = register(new, model, degrees, options, seed)
+            found = descend(new, found, model, options, seed, LONGER)
+            found = told_by_others(new, found, shots, cameras, mesh, model, degrees, options, seed)
+            bank = make_bank(found, [s.rgb for s in new], [s.mask for s in new])
+            size = maps["roughness"].shape[0]
+            material = start_material(size, maps["base_color"], 0.5, 0.0)
+            material.colour = mi.Float(
+                np.concatenate([maps["base_color"], maps["roughness"][..., None]], -1)
+                .astype(np.float32)
+                .ravel()
+            )
+            material.metallic = mi.Float(maps["metallic"].astype(np.float32).ravel())
+            n = maps["normal"]
+            material.slope = mi.Float(
+                (n[..., :2] / np.maximum(n[..., 2:], 0.1)).astype(np.float32).ravel()
+            )
+            lit = start_collection_surface(
+                material, np.array([s.tint for s in new]), ALBEDO_START, light_family(options)
+            )
+            areas = vertex_areas(mesh)
+            scale = ALBEDO_START / float((albedo * areas[:, None]).sum() / areas.sum() / 3)
+            o = SurfaceOptions(options.frozen_steps, options.points, options.directions, size)
+            fit_collection_surface(
+                bank,
+                TraceableMesh(mesh, albedo * scale),
+                lit,
+                o,
+                light_options(options),
+                stage,
+                seed,
+                frozen=True,
+            )
+            kept = {
+                "poses": np.array([c.world_from_camera for c in found]),
+                "focal": np.array([c.fx for c in found]),
+                "lights": np.exp(lit.lights()).reshape(-1, ROWS, COLUMNS, 3),
+            }
+            stage.save("photos", **kept)
+    found = [
+        replace(s.camera, fx=f, fy=f, world_from_camera=p)
+        for s, f, p in zip(held, kept["focal"], kept["poses"], strict=True)
+    ]
+    return found, kept["lights"]
+
+
+def with_median_field(shot: Shot, cameras: list[Camera]) -> Camera:
+    """A held-out photo without EXIF starts with the median focal length of the others, in units of
+    the longer side."""
+    if shot.photo.focal_hint is not None or shot.photo.camera is not None:
+        return shot.camera
+    focal = float(np.median([c.fx / max(c.width, c.height) for c in cameras])) * max(
+        shot.camera.width, shot.camera.height
+    )
+    return replace(shot.camera, fx=focal, fy=focal)
+
+
+def find(
+    shots: list[Shot], model: VolumeModel, degrees: float, keep: int, seed: int, slid: bool = False
+):
+    """(crops, their descriptors, what renders the model, `keep` hypotheses of every photo) by
+    search from all around. slid: those that the frame cuts with place and size free (takes a second
+    a photo)."""
+    crops, hints = crops_of(shots), np.array([s.direction for s in shots])
+    render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops, PARTS)
+    gallery = make_gallery(render, views_from(directions_around(AGAIN, seed)), PARTS)
+    hinted = np.linalg.norm(hints, axis=1) > 0.5
+    prior = 0.03 * hint_prior(gallery, hints, degrees, 60.0) * hinted[:, None, None]
+    allowed = near(gallery, hints, degrees + SLACK) | ~hinted[:, None]
+    found = search(crops, gallery, keep, rings=rings, prior=prior, allowed=allowed)
+    cut = np.flatnonzero([is_cut(c) for c in crops])
+    if slid and len(cut):
+        more = slide(
+            [crops[i] for i in cut], render, gallery.cameras, keep, allowed[cut], prior[cut].max(2)
+        )
+        found.poses[cut], found.scores[cut] = more.poses, more.scores
+    return crops, rings, render, found
+
+
+def register(
+    shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int
+) -> list[Camera]:
+    """The cameras of photos that the model has not seen, by search and local refinement."""
+    crops, rings, render, found = find(shots, model, degrees, options.hypotheses, seed, slid=True)
+    poses, _ = best_refined(crops, found, render, rings, options.hypotheses)
+    return [s.camera.with_pose(p) for s, p in zip(shots, poses, strict=True)]
+
+
+def told_by_others(
+    new,
+    found: list[Camera],
+    shots,
+    cameras,
+    mesh,
+    model: VolumeModel,
+    degrees,
+    options: CollectionOptions,
+    seed: int,
+):
+    """The cameras `found` of `new` photos, but for those that from elsewhere show more of what
+    `shots` show there."""
+    places = far_from(
+        found, other_places(new, found, model, degrees, np.zeros(len(new), bool), options, seed)
+    )
+    if not places:
+        return found
+    surface = surface_of(mesh)
+    laid = np.array(
+        [laid_on(surface, c, detail_of(s.rgb, s.mask)) for c, s in zip(cameras, shots, strict=True)]
+    )
+    told = told_apart(surface, [detail_of(s.rgb, s.mask) for s in new], found, places, laid).moved
+    return [told.get(i, c) for i, c in enumerate(found)]
+
+
+@dataclass(frozen=True)
+class SecondLook:
+    """cameras: of all photos. moved: numbers of the photos that moved. detail: (P,), see
+    `borne_out`. as_well: (P,) degrees by which another place, from which a photo shows about as
+    much of what the others show, is turned against its own; 0 where there is none."""
+
+    cameras: list[Camera]
+    moved: list[int]
+    detail: np.ndarray
+    as_well: np.ndarray
+
+
+def look_again(
+    shots: list[Shot],
+    cameras: list[Camera],
+    model: VolumeModel,
+    degrees: float,
+    still,
+    options: CollectionOptions,
+    seed: int,
+):
+    """A SecondLook: every photo is searched for in the finished model, whose detail tells apart
+    what the coarse ones took for each other. Photos that fit elsewhere by GAIN move there, and so
+    do those that from elsewhere show more of what the others show there (a
+    stool from above, half a turn away: fit/registration/fine_detail.py). still: (P,) bool, photos
+    that stay."""
+    places = other_places(shots, cameras, model, degrees, still, options, seed)
+    out, moved = list(cameras), {}
+    for i, camera, gain in places:  # the best comes first
+        if gain > GAIN and i not in moved:
+            out[i] = moved[i] = camera
+    surface = surface_of(extract_mesh(dense_values(model.grid), faces=options.faces))
+    pictures = [detail_of(s.rgb, s.mask) for s in shots]
+    told = told_apart(surface, pictures, out, far_from(out, places))
+    out = [told.moved.get(i, c) for i, c in enumerate(out)]
+    turns = np.zeros(len(out))
+    for i, camera in told.as_well.items():
+        turns[i] = turn_between(out[i].world_from_camera, camera.world_from_camera)
+    return SecondLook(out, sorted(moved | told.moved), borne_out(surface, pictures, out), turns)
+
+
+def other_places(
+    shots,
+    cameras: list[Camera],
+    model: VolumeModel,
+    degrees: float,
+    still,
+    options: CollectionOptions,
+    seed: int,
+):
+    """[(photo, camera, by how much the score is better than at its own camera)], the best first:
+    where else in the finished model each photo may have been taken, ELSEWHERE away or more,
+    descended."""
+    shots = [replace(s, camera=c.with_pose(np.eye(4))) for s, c in zip(shots, cameras, strict=True)]
+    present = np.array([c.world_from_camera for c in cameras])
+    crops, rings, render, found = find(
+        shots, model, degrees, CHOICES if options.hypotheses > 1 else 1, seed
+    )
+    _, height = refine(crops, present, render, rings=rings, steps=(0,), parts=PARTS)
+    still = still | np.array(
+        [is_cut(c) for c in crops]
+    )  # whole silhouettes are compared: they tell nothing of cut ones
+    apart = np.array(
+        [[turn_between(p, q) for q in row] for p, row in zip(present, found.poses, strict=True)]
+    )
+    photo, which = np.nonzero(
+        (found.scores > height[:, None] - 0.1) & (apart > ELSEWHERE) & ~still[:, None]
+    )
+    if not len(photo):
+        return []
+    some = [crops[i] for i in photo]
+    poses, scores = refine(
+        some,
+        found.poses[photo, which],
+        render,
+        rings=crop_rings(some, PARTS),
+        steps=COARSE,
+        parts=PARTS,
+    )
+    gains = scores - height[photo]
+    turns = [turn_between(present[i], p) for i, p in zip(photo, poses, strict=True)]
+    kept = [
+        k for k in np.argsort(-gains) if gains[k] > GAIN or (gains[k] > -WORSE and turns[k] > FAR)
+    ]
+    if not kept:
+        return []
+    placed = descend(
+        [shots[photo[k]] for k in kept],
+        [cameras[photo[k]].with_pose(poses[k]) for k in kept],
+        model,
+        options,
+        seed,
+    )
+    return [
+        (int(photo[k]), camera, float(gains[k])) for k, camera in zip(kept, placed, strict=True)
+    ]
+
+
+def far_from(cameras: list[Camera], places) -> list[tuple[int, Camera]]:
+    """(photo, camera) of those of `other_places` that are FAR from where the photo is now."""
+    return [
+        (i, c)
+        for i, c, _ in places
+        if turn_between(cameras[i].world_from_camera, c.world_from_camera) > FAR
+    ]
+
+
+def turn_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between two poses (4, 4)."""
+    return rotation_angle(a[:3, :3].T @ b[:3, :3])
+
+
+def descend(
+    shots: list[Shot],
+    cameras: list[Camera],
+    model: VolumeModel,
+    options: CollectionOptions,
+    seed: int,
+    longer=1,
+) -> list[Camera]:
+    """The cameras after a descent with the shape frozen: pose, distance, focal length and small
+    lights move. longer: in `frozen_steps`."""
+    bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
+    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    learnt, rates = start_photo_lights(np.array([s.tint for s in shots]), GREY)
+    own = replace(model, reflections=learnt, rates=rates, appearance=shade_photos, extra={})
+    own.grid = replace(model.grid)
+    o = VolumeOptions(
+        (model.grid.n,),
+        (longer * max(60, options.frozen_steps),),
+        options.rays // 2,
+        sdf_rate=0.0,
+        feature_rate=0.0,
+        diffusion=0.0,
+        eikonal=0.0,
+        sharpness=(2.0, 6.0),
+        refine_cameras=options.refine_cameras,
+    )
+    fit_volume(bank, own, o, NoStage(), seed)
+    return corrected(cameras, np.array(bank.corrections))

@@ -1,0 +1,64 @@
+"""The search of few identical objects, repeated from the start.
+
+Of six objects two in wrong places can bear each other out: the model of all takes them up, and no
+score within one search tells. A search in which nearly all were sure of their places is believed.
+Otherwise another seed begins from other viewpoints and ends elsewhere, unless
+the poses are right: searches that come to the same poses are believed, and where no two do, the one
+whose objects agree best with a model of all of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from relit.fit.registration.instances.options import Search
+from relit.fit.registration.instances.rounds import model_of_all
+from relit.fit.registration.instances.search import place
+from relit.fit.registration.instances.views import View
+from relit.geometry.hull import NoShape
+from relit.geometry.se3 import turns_apart
+
+FEW = 8  # objects up to which one search is not enough
+SAME = 15.0  # degrees within which two searches have put all objects alike
+
+
+def place_few(
+    views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None
+) -> tuple[np.ndarray, np.ndarray]:
+    """`place`, for few objects up to `o.searches` times: poses (N, 4, 4) and scores (N,). Raises
+    NoShape where every search does."""
+    if not 2 < len(views) <= FEW or not o.descents or o.searches < 2:
+        one = place(views, o, seed=seed, links=links, say=say)
+        return one.poses, one.scores
+    found: list[tuple[float, np.ndarray, np.ndarray]] = []
+    for trial in range(o.searches):
+        try:
+            one = place(views, o, seed=seed + 1000 * trial, links=links, say=say)
+        except NoShape:
+            if trial == o.searches - 1 and not found:
+                raise
+            continue
+        poses, scores = one.poses, one.scores
+        if one.sure:
+            return poses, scores
+        _, own = model_of_all(views, poses, o, seed=seed)
+        agreement = float(own.mean())
+        like = [other for other in found if turned_apart(poses, other[1]) < SAME]
+        found.append((agreement, poses, scores))
+        say(
+            f"search {trial + 1} of at most {o.searches}: agreement of all with a model of all {agreement:.3f}"
+        )
+        if like:
+            say("two searches have come to the same poses")
+            return max([*like, found[-1]], key=lambda one: one[0])[1:]
+    agreement, poses, scores = max(found, key=lambda one: one[0])
+    say(
+        f"note: no two of {o.searches} searches come to the same poses: the best is taken (agreement {agreement:.3f}); look at the result"
+    )
+    return poses, scores
+
+
+def turned_apart(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees by which that object is turned which two sets of poses (N, 4, 4) object_from_camera
+    put most differently."""
+    return float(turns_apart(a, b).max())

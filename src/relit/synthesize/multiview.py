@@ -1,0 +1,435 @@
+"""Captures with known truth: photos of a GLB or OBJ under an HDRI, rendered by Mitsuba's path
+tracer.
+
+The folder is a NeRF-synthetic capture (`transforms_{train,test}.json`, 8-bit sRGB RGBA with
+straight alpha) with the truth beside it:
+
+    transforms_train.json  train/r_000.png ...
+    transforms_test.json   test/t_000.png ...
+    truth/truth.json                                   what was rendered and how; written last
+    truth/mesh.ply  truth/environment.exr              in the world frame (y up); the light as
+                                                       scaled by the exposure
+    truth/test/NAME.exr                                linear RGBA, premultiplied on black
+    truth/test/NAME_{albedo,normal,roughness,metallic,depth}.exr     albedo and normal carry the
+                                                                     coverage as their alpha
+    truth/train_albedo/NAME.exr                        linear RGBA of a few training views, to fix
+                                                       the albedo scale
+    truth/relight/LIGHT.exr  truth/relight/LIGHT/NAME.exr            other lights, and the test
+                                                                     views under them
+
+World frame: the middle of the object's bounding box is the origin and its farthest vertex lies at
+RADIUS. Cameras look at the origin.
+
+Nothing but the benchmark, the demo and the command line imports this module: it alone of `capture`
+reaches up to `asset` and `rendering`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from relit.conventions import move_points, similarity, world_from_gl_camera
+from relit.errors import UserError
+from relit.files import write_text
+from relit.geometry.se3 import look_at
+from relit.scene import Camera, Material, Mesh
+
+VERSION = 1  # of the layout and of what is rendered; part of the settings' hash
+RADIUS = 0.8  # of the object's bounding sphere, world units
+FOV = 40.0  # degrees, both axes
+LOWEST = -35.0  # degrees of elevation below which no camera stands (a table would be in the way)
+WHITE = 0.9  # linear value of the 99th percentile of the object's pixels
+SCALE_VIEWS = 8  # training views whose albedo is kept to fix the albedo scale
+
+
+def synthesize_multiview(
+    asset_file: str | Path,
+    light_file: str | Path,
+    out: str | Path,
+    *,
+    views: int = 60,
+    test_views: int = 12,
+    relights: Sequence[str | Path] = (),
+    resolution: int = 400,
+    spp: int = 64,
+    test_spp: int = 256,
+    seed: int = 0,
+    truth_bsdf: str = "relit",
+    roughness: float | None = None,
+    metallic: float | None = None,
+    max_depth: int = 6,
+    say: Callable[[str], None] = lambda text: None,
+) -> Path:
+    """Render a multi-view capture of one object under one light, with its truth, into `out`;
+    returns `out`.
+
+    asset_file: .glb, .gltf or .obj. light_file, relights: lat-long .hdr or .exr in Mitsuba's axes.
+    spp, test_spp: samples a pixel of the training photos and of everything that is measured
+    against. roughness, metallic: replace the file's maps by a constant (an OBJ has none).
+    truth_bsdf: 'relit' (the package's own metallic-roughness model) or 'principled' (Mitsuba's).
+
+    Deterministic by `seed`. A call with the same settings takes up where a killed one stopped and
+    returns at once when all is there.
+
+    Raises UserError when a file cannot be read, a number makes no sense, or `out` holds something
+    else.
+    """
+    asset_file, light_file, out = Path(asset_file), Path(light_file), Path(out)
+    relights = [Path(r) for r in relights]
+    _check(relights, views, test_views, resolution, spp, test_spp, truth_bsdf, roughness, metallic)
+    settings = settings_of(
+        asset_file,
+        light_file,
+        views=views,
+        test_views=test_views,
+        relights=relights,
+        resolution=resolution,
+        spp=spp,
+        test_spp=test_spp,
+        seed=seed,
+        truth_bsdf=truth_bsdf,
+        roughness=roughness,
+        metallic=metallic,
+        max_depth=max_depth,
+    )
+    if claim_folder(out, settings):
+        return out
+
+    from relit.asset.gltf import read_asset_file
+    from relit.images import read_image, write_linear
+    from relit.reference.mitsuba_scene import build_scene
+
+    mesh, material = read_asset_file(asset_file)
+    material = overridden(material, roughness, metallic)
+    world_from_asset = object_frame(mesh)
+    train = orbit_cameras(views, resolution, seed=seed, prefix="train/r_")
+    test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="test/t_")
+    truth = out / "truth"
+    write_mesh(truth / "mesh.ply", mesh, world_from_asset)
+    _write_transforms(out / "transforms_train.json", train, resolution)
+    _write_transforms(out / "transforms_test.json", test, resolution)
+
+    def lit(file: Path):
+        """Scene under a light whose exposure fits the object, and that light."""
+        environment = read_image(file).rgb
+        scene = build_scene(mesh, material, world_from_asset, environment, bsdf=truth_bsdf)
+        environment = (environment * exposure(scene, train, max_depth)).astype(np.float32)
+        return build_scene(
+            mesh, material, world_from_asset, environment, bsdf=truth_bsdf
+        ), environment
+
+    scene, environment = lit(light_file)
+    write_linear(truth / "environment.exr", environment)
+    scale_names = [
+        train[i][0]
+        for i in np.unique(np.linspace(0, views - 1, min(SCALE_VIEWS, views)).round().astype(int))
+    ]
+    for i, (name, camera) in enumerate(train):
+        write_training_view(
+            out, scene, name, camera, spp, max_depth, seed * 1_000_003 + i, name in scale_names
+        )
+        tell_progress(say, "training photo", i, views)
+    for i, (name, camera) in enumerate(test):
+        write_test_view(
+            out, scene, name, camera, test_spp, max_depth, seed * 1_000_003 + 500_000 + i
+        )
+        tell_progress(say, "test view", i, test_views)
+    for j, file in enumerate(relights):
+        scene, environment = lit(file)
+        folder = truth / "relight" / file.stem
+        write_linear(folder.with_suffix(".exr"), environment)
+        for i, (name, camera) in enumerate(test):
+            target = folder / f"{Path(name).name}.exr"
+            if not target.exists():
+                write_linear(
+                    target,
+                    radiance(
+                        scene,
+                        camera,
+                        test_spp,
+                        max_depth,
+                        seed * 1_000_003 + 600_000 + 1000 * j + i,
+                    ),
+                )
+            tell_progress(say, f"test view under {file.stem}", i, test_views)
+
+    write_json(
+        truth / "truth.json",
+        {
+            "settings": settings,
+            "world_from_asset": world_from_asset.tolist(),
+            "sphere": {"centre": [0.0, 0.0, 0.0], "radius": RADIUS},
+            "ior": material.ior,
+            "train": [name for name, _ in train],
+            "test": [name for name, _ in test],
+            "train_albedo": [Path(n).name for n in scale_names],
+            "relight": [file.stem for file in relights],
+        },
+    )
+    return out
+
+
+# ---------------------------------------------------------------- where things stand
+
+
+def object_frame(mesh: Mesh, radius: float = RADIUS) -> np.ndarray:
+    """world_from_asset (4, 4): the middle of the bounding box goes to the origin, the farthest
+    vertex to `radius`."""
+    v = np.asarray(mesh.vertices, np.float64)
+    centre = (v.min(0) + v.max(0)) / 2
+    reach = np.linalg.norm(v - centre, axis=1).max()
+    if not reach > 0:
+        raise UserError("the asset has no extent", "all its vertices coincide")
+    return similarity(np.eye(3), -radius / reach * centre, radius / reach)
+
+
+def orbit_cameras(
+    count: int,
+    resolution: int,
+    *,
+    seed: int = 0,
+    prefix: str = "r_",
+    fov: float = FOV,
+    radius: float = RADIUS,
+) -> list[tuple[str, Camera]]:
+    """(name, Camera) pairs on a jittered Fibonacci spiral over the sphere above LOWEST, each with
+    the whole bounding sphere in frame.
+
+    The distance is the least that frames the sphere times a random 1 to 1.08; roll within 5
+    degrees.
+    """
+    rng = np.random.default_rng(seed)
+    low = np.sin(np.radians(LOWEST))
+    focal = resolution / (2 * np.tan(np.radians(fov) / 2))
+    least = radius / np.sin(np.radians(fov) / 2)
+    turn, cameras = rng.uniform(0, 2 * np.pi), []
+    for i in range(count):
+        y = np.clip(1 - (1 - low) * (i + 0.5 + rng.uniform(-0.3, 0.3)) / count, low, 0.998)
+        azimuth = turn + i * np.pi * (3 - np.sqrt(5)) + rng.normal() * 0.3 / np.sqrt(count)
+        r = np.sqrt(1 - y * y)
+        centre = (
+            np.array([r * np.cos(azimuth), y, r * np.sin(azimuth)]) * least * rng.uniform(1.0, 1.08)
+        )
+        pose = look_at(centre, roll=np.radians(rng.uniform(-5, 5)))
+        half = resolution / 2
+        cameras.append(
+            (f"{prefix}{i:03d}", Camera(resolution, resolution, focal, focal, half, half, pose))
+        )
+    return cameras
+
+
+# ---------------------------------------------------------------- rendering
+
+
+def radiance(scene, camera: Camera, spp: int, max_depth: int, seed: int) -> np.ndarray:
+    """(H, W, 4) float32 linear premultiplied radiance and coverage."""
+    from relit.reference.mitsuba_scene import render
+
+    return render(scene, camera, spp=spp, seed=seed, max_depth=max_depth)
+
+
+def exposure(scene, cameras: Sequence[tuple[str, Camera]], max_depth: int) -> float:
+    """Factor on the light that puts the 99th percentile, over the object's pixels in 8 small views,
+    of the brightest channel at WHITE."""
+    values = []
+    for i in np.unique(np.linspace(0, len(cameras) - 1, min(8, len(cameras))).round().astype(int)):
+        picture = radiance(scene, cameras[i][1].resized(100, 100), 64, max_depth, 77 + int(i))
+        inside = picture[..., 3] > 0.99
+        values.append(picture[..., :3][inside].max(-1))
+    values = np.concatenate(values) if values else np.zeros(0)
+    level = float(np.percentile(values, 99)) if values.size else 0.0
+    if not level > 0:
+        raise UserError(
+            "the object is black under this light",
+            "the light file holds no light, or the asset covers no pixel",
+        )
+    return WHITE / level
+
+
+def write_training_view(
+    out: Path, scene, name: str, camera: Camera, spp: int, max_depth: int, seed: int, albedo: bool
+) -> None:
+    """NAME.png, and with `albedo` its base colour in truth/train_albedo; what is there already is
+    kept."""
+    photo = out / f"{name}.png"
+    if not photo.exists():
+        _write_rgba(photo, radiance(scene, camera, spp, max_depth, seed))
+    target = out / "truth" / "train_albedo" / f"{Path(name).name}.exr"
+    if albedo and not target.exists():
+        from relit.images import write_linear
+        from relit.reference.mitsuba_scene import render_channels
+
+        channels = render_channels(scene, camera, spp=16)
+        write_linear(target, np.concatenate([channels["albedo"], channels["alpha"][..., None]], -1))
+
+
+def write_test_view(
+    out: Path, scene, name: str, camera: Camera, spp: int, max_depth: int, seed: int
+) -> None:
+    """NAME.png, truth/test/NAME.exr and its channels; a view that is complete is kept."""
+    from relit.images import write_linear
+    from relit.reference.mitsuba_scene import render_channels
+
+    stem = out / "truth" / "test" / Path(name).name
+    picture, photo = stem.with_suffix(".exr"), out / f"{name}.png"
+    if picture.exists() and photo.exists():
+        return
+    channels = render_channels(scene, camera, spp=64)
+    for key in ("albedo", "normal"):
+        write_linear(
+            stem.with_name(f"{stem.name}_{key}.exr"),
+            np.concatenate([channels[key], channels["alpha"][..., None]], -1),
+        )
+    for key in ("roughness", "metallic", "depth"):
+        write_linear(stem.with_name(f"{stem.name}_{key}.exr"), channels[key])
+    rgba = radiance(scene, camera, spp, max_depth, seed)
+    _write_rgba(photo, rgba)
+    write_linear(picture, rgba)  # last: its presence says that the view is complete
+
+
+# ---------------------------------------------------------------- files
+
+
+def _check(
+    relights, views, test_views, resolution, spp, test_spp, truth_bsdf, roughness, metallic
+) -> None:
+    if len({f.stem for f in relights}) < len(relights):
+        raise UserError(
+            "two relighting files have one name", "the truth is kept by name", "rename one of them"
+        )
+    for label, value, least in [
+        ("views", views, 2),
+        ("test_views", test_views, 1),
+        ("resolution", resolution, 8),
+    ]:
+        if value < least:
+            raise UserError(f"{label} = {value} is too few", fix=f"at least {least}", code=2)
+    for label, value in [("roughness", roughness), ("metallic", metallic)]:
+        if value is not None and not 0 <= value <= 1:
+            raise UserError(f"{label} = {value} is outside [0, 1]", code=2)
+    if spp < 1 or test_spp < 1:
+        raise UserError("samples per pixel must be at least 1", code=2)
+    if truth_bsdf not in ("relit", "principled"):
+        raise UserError(
+            f"unknown truth_bsdf '{truth_bsdf}'", fix="choose relit or principled", code=2
+        )
+
+
+def identity_of(file: Path) -> dict[str, str]:
+    """{"name", "sha256"} of a file, what lies beside an OBJ or a glTF counted: the same content is
+    the same capture."""
+    digest = hashlib.sha256(file.read_bytes())
+    if file.suffix.lower() in (".obj", ".gltf"):  # what they refer to lies beside them
+        for sibling in sorted(p for p in file.parent.iterdir() if p.is_file() and p != file):
+            digest.update(sibling.name.encode() + sibling.read_bytes())
+    return {"name": file.name, "sha256": digest.hexdigest()[:16]}
+
+
+def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) -> dict[str, Any]:
+    """Everything that a capture depends on: the options of `synthesize_multiview`, its defaults,
+    and digests of the files."""
+    files = {"asset": Path(asset_file), "light": Path(light_file)}
+    relights = [Path(r) for r in options.pop("relights", ())]
+    for what, file in [*files.items(), *(("light", r) for r in relights)]:
+        if not file.is_file():
+            raise UserError(
+                f"no {what} file: {file}",
+                fix=f"give an existing {'GLB or OBJ' if what == 'asset' else 'HDR or EXR'} file",
+            )
+    defaults = synthesize_multiview.__kwdefaults__
+    plain = {
+        key: options.get(key, value)
+        for key, value in defaults.items()
+        if key not in ("relights", "say")
+    }
+    digests = {what: identity_of(file) for what, file in files.items()}
+    return {
+        "version": VERSION,
+        "kind": "multiview",
+        **digests,
+        "relights": [identity_of(r) for r in relights],
+        **plain,
+    }
+
+
+def settings_hash(settings: dict[str, Any]) -> str:
+    """12 hex digits that name a set of settings."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def claim_folder(out: Path, settings: dict[str, Any]) -> bool:
+    """Whether `out` is complete already. Marks it as ours; refuses a folder that holds anything
+    else."""
+    marker = out / "truth" / "settings.json"
+    if marker.exists():
+        if json.loads(marker.read_text()) != settings:
+            raise UserError(
+                "the output folder holds a capture rendered with other settings",
+                fix=f"choose another folder, or delete this one: {out}",
+            )
+        return (out / "truth" / "truth.json").exists()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(
+            "the output folder is not empty and holds no synthetic capture",
+            fix=f"choose a new folder: {out}",
+        )
+    write_json(marker, settings)
+    return False
+
+
+def overridden(material: Material, roughness: float | None, metallic: float | None) -> Material:
+    """The material with these constants in the place of its maps, None: as it is."""
+    for key, value in (("roughness", roughness), ("metallic", metallic)):
+        if value is not None:
+            material = replace(material, **{key: np.full_like(getattr(material, key), value)})
+    return material
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically, its folder made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, json.dumps(content, indent=1))
+
+
+def _write_transforms(path: Path, cameras: Sequence[tuple[str, Camera]], resolution: int) -> None:
+    angle = 2 * np.arctan(resolution / (2 * cameras[0][1].fx))
+    frames = [
+        {
+            "file_path": f"./{name}",
+            "transform_matrix": world_from_gl_camera(camera.world_from_camera).tolist(),
+        }
+        for name, camera in cameras
+    ]
+    write_json(path, {"camera_angle_x": float(angle), "frames": frames})
+
+
+def _write_rgba(path: Path, picture: np.ndarray) -> None:
+    """8-bit sRGB PNG with straight alpha of a linear premultiplied picture (H, W, 4)."""
+    from relit.images import write_srgb
+
+    alpha = np.clip(picture[..., 3:], 0, 1)
+    rgb = np.clip(picture[..., :3] / np.maximum(alpha, 1e-4), 0, 1) * (alpha > 0)
+    write_srgb(path, np.concatenate([rgb, alpha], -1))
+
+
+def write_mesh(path: Path, mesh: Mesh, world_from_asset: np.ndarray) -> None:
+    """The mesh in the world frame as PLY, atomically."""
+    import trimesh
+
+    from relit.images import write_bytes
+
+    moved = trimesh.Trimesh(move_points(world_from_asset, mesh.vertices), mesh.faces, process=False)
+    write_bytes(path, moved.export(file_type="ply"))
+
+
+def tell_progress(say: Callable[[str], None], what: str, index: int, count: int) -> None:
+    """'training view 10 of 36', for the first, the last and every tenth."""
+    if index == 0 or index + 1 == count or (index + 1) % 10 == 0:
+        say(f"{what} {index + 1} of {count}")
