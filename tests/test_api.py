@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 from PIL import Image
-from test_faults import write_capture
 
 import relit
 from relit.asset.asset import save_asset
@@ -18,6 +17,7 @@ from relit.images import write_linear
 from relit.scene import Asset, Camera
 from relit.synthesize.procedural import pawn, studio
 from relit.viewer.page import PAGE
+from support.striped_ball import write_capture
 
 TINY = {"levels": [16], "level_steps": [12], "rays": 128, "faces": 300, "texture": 16, "light": 4}
 TINY |= {"surface_steps": 4, "points": 32, "directions": 4}

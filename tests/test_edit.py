@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cv2 import imwrite as cv_write
-from two_pawns import two_pawns
 
 from relit.asset.asset import load_asset, save_asset
 from relit.edit import as_shown, camera_of, edit, insert
@@ -20,6 +19,7 @@ from relit.reference.photographed import as_photographed
 from relit.reference.pile import build_pile, instance_ids
 from relit.relight import relight
 from relit.scene import Asset, Camera, Flash, Instance
+from support.two_pawns import two_pawns
 
 
 @pytest.fixture(scope="module")

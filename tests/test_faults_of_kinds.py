@@ -9,7 +9,10 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from test_faults import SIDE, answered, edit, picture, relit, write_capture
+
+from support.commands import answered, relit
+from support.small_captures import answer, collection
+from support.striped_ball import SIDE, edit, picture, write_capture
 
 BALL = ["--sphere", "0,0,0,0.9"]
 
@@ -116,22 +119,6 @@ def tiny_instances(f):
 
 # ---------------------------------------------------------------- collection: six photos of the
 # ball with masks
-
-
-def collection(folder):
-    (folder / "image").mkdir(parents=True)
-    (folder / "mask").mkdir()
-    for i in range(6):
-        rgba = picture(i)
-        Image.fromarray(rgba[..., :3]).save(folder / f"image/{i}.png")
-        Image.fromarray(rgba[..., 3]).save(folder / f"mask/{i}.png")
-    answer(folder, ["Left", "Center", "Front"])
-    return folder
-
-
-def answer(f, words, ending="png"):
-    frames = [{"image_name": f"{i}.{ending}", "quadrant": words} for i in range(6)]
-    (f / "quadrants.json").write_text(json.dumps({"frames": frames}))
 
 
 def three_photos(f):

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_faults import write_capture
 
 from relit.asset.asset import load_asset
 from relit.cli.verbs import VERBS, parser_for
@@ -24,6 +23,7 @@ from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS as DUPLICATES
 from relit.evaluate.flash import FLASH_DEFINITIONS as FLASH
 from relit.files import parse_toml
 from relit.viewer.page import PAGE
+from support.striped_ball import write_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

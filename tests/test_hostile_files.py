@@ -12,7 +12,6 @@ import subprocess
 import sys
 import zipfile
 import zlib
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,6 +33,7 @@ from relit.lighting.spherical_gaussians import read_json as read_gaussians
 from relit.masks.files import read_mask
 from relit.scene import Asset, Camera, Flash, Ground, Instance
 from relit.synthesize.procedural import pawn
+from support import ROOT
 
 FUZZ = settings(
     max_examples=100, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
@@ -514,7 +514,7 @@ COLMAP = """
 import random, shutil, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from shots import ring, write_colmap_text, write_photos
+from support.camera_ring import ring, write_colmap_text, write_photos
 import pycolmap
 from relit.capture.open import open_capture
 from relit.errors import UserError
@@ -554,7 +554,7 @@ print(answers["read"], answers["refused"])
 
 def test_spoilt_colmap_models(tmp_path):
     """In another process: the reader is native code, which may end the process or read for ever."""
-    here = Path(__file__).parent / "capture"
+    here = ROOT / "tests"
     done = subprocess.run(
         [sys.executable, "-c", COLMAP, str(here), str(tmp_path)],
         capture_output=True,

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_machine_faults import JOB, TINY, collection_photos, flash_photos
 
 from relit.asset.asset import load_asset
 from relit.capture.open import open_capture
@@ -21,8 +20,8 @@ from relit.geometry.se3 import camera_errors
 from relit.job import Job
 from relit.reconstruction import with_cameras
 from relit.run import Run
-
-sys.path.insert(0, str(Path(__file__).parent / "cameras"))
+from support.commands import JOB, TINY
+from support.small_captures import collection_photos, flash_photos
 
 # no checkpoint is too early; killed at the third that the stage of a name saves, or at its end,
 # before it is called done
@@ -78,9 +77,8 @@ def limited():
 
 def room_photos(folder: Path) -> tuple[Path, list[str]]:
     """A corner of a room without cameras."""
-    from test_sfm import arc, photo
-
     from relit.images import write_data, write_srgb
+    from support.room_corner import arc, photo
 
     for i, camera in enumerate(arc()):
         rgb, mask = photo(camera)
@@ -90,7 +88,7 @@ def room_photos(folder: Path) -> tuple[Path, list[str]]:
 
 
 def unmasked_photos(folder: Path) -> tuple[Path, list[str]]:
-    from test_faults import write_capture
+    from support.striped_ball import write_capture
 
     steps = [
         "explore_steps=100",
@@ -110,9 +108,7 @@ def pile_photo(folder: Path) -> tuple[Path, list[str]]:
     from relit.images import write_linear
     from relit.synthesize.duplicates import synthesize_duplicates
     from relit.synthesize.procedural import pawn
-
-    sys.path.insert(0, str(Path(__file__).parent / "fit"))
-    from test_duplicates_recipe import true_poses
+    from support.pile_of_pawns import true_poses
 
     folder.mkdir(parents=True)
     write_glb(folder / "pawn.glb", *pawn(rows=16, columns=20, texture=32))

@@ -15,24 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from test_faults import answered, write_capture
 
 from relit.asset.asset import load_asset
 from relit.cli import main as cli
 from relit.report import page as report
 from relit.run import Run
+from support.commands import JOB, TINY, answered
+from support.small_captures import collection_photos, flash_photos
+from support.striped_ball import write_capture
 
-TINY = {
-    "levels": 24,
-    "level_steps": 20,
-    "rays": 256,
-    "faces": 600,
-    "texture": 32,
-    "surface_steps": 8,
-    "points": 64,
-    "directions": 8,
-    "light": 8,
-}
 WORDS = [
     "--quality",
     "draft",
@@ -40,14 +31,6 @@ WORDS = [
     "cpu",
     *[w for k, v in TINY.items() for w in ("--set", f"{k}={v}")],
 ]
-# the command line with a small report
-JOB = """
-import sys
-from relit.report import page as report
-report.SIDE, report.STILLS, report.SPP, report.SPP_COMPARED, report.VIEWS = 24, 2, 1, 1, 1
-from relit.cli.main import main
-sys.exit(main(sys.argv[1:]))
-"""
 
 
 @pytest.fixture(scope="module")
@@ -379,21 +362,6 @@ def test_memory_stays_flat_over_500_steps(capture, tmp_path, masks, passes):
     }
     assert passes <= set(grown), done.stdout
     assert all(mb < 6 for mb in grown.values()), grown
-
-
-def flash_photos(folder: Path) -> tuple[Path, list[str]]:
-    """The ball with cameras in a file that tells no kind, and the words that make it a small flash
-    job."""
-    return write_capture(folder), ["--capture", "flash", "--set", "hollows=0"]
-
-
-def collection_photos(folder: Path) -> tuple[Path, list[str]]:
-    """The ball from six sides with masks and quadrants, and the words that make it a small job."""
-    from test_faults_of_kinds import collection
-
-    small = {"side": 48, "rounds": 1, "polish": 0, "keep": 1, "frozen_steps": 4, "least_score": 0.1}
-    pairs = [w for k, v in small.items() for w in ("--set", f"{k}={v}")]
-    return collection(folder), ["--capture", "collection", *pairs, "--set", "without=links"]
 
 
 @pytest.mark.parametrize("make", [flash_photos, collection_photos], ids=lambda m: m.__name__)

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from test_faults import picture, write_capture
 
 from relit.asset.asset import load_asset
 from relit.cli import main as cli
@@ -22,6 +21,7 @@ from relit.job import Job, check_memory, estimate, open_input
 from relit.report import page as report
 from relit.scene import Asset
 from relit.synthesize.procedural import pawn, studio
+from support.striped_ball import picture, write_capture
 
 CALLS: list[tuple] = []
 

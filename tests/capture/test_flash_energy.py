@@ -3,20 +3,20 @@ scaled where the flash's power differs."""
 
 import numpy as np
 import pytest
-import shots
 
 from relit.capture.open import open_capture
 from relit.errors import UserError
 from relit.job import Job, open_as
+from support import camera_ring
 
 
 @pytest.fixture
 def folder(tmp_path, cameras):
     """A function that writes the camera file with energies, {index: three numbers}."""
-    shots.write_photos(tmp_path / "image", cameras)
+    camera_ring.write_photos(tmp_path / "image", cameras)
 
     def write(energies):
-        arrays = {f"world_mat_{i}": shots.projection(c) for i, c in enumerate(cameras)}
+        arrays = {f"world_mat_{i}": camera_ring.projection(c) for i, c in enumerate(cameras)}
         arrays |= {f"scale_mat_{i}": np.diag([1.5, 1.5, 1.5, 1.0]) for i in range(len(cameras))}
         arrays |= {f"light_energy_{i}": np.asarray(e) for i, e in energies.items()}
         np.savez(tmp_path / "cameras_sphere.npz", **arrays)
@@ -27,7 +27,7 @@ def folder(tmp_path, cameras):
 
 @pytest.fixture
 def cameras():
-    return shots.ring()
+    return camera_ring.ring()
 
 
 def test_photos_without_flash_are_left_out(folder):

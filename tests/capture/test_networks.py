@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from tiny_onnx import write_pointwise
 
 from relit.capture.networks import MEAN, SPREAD, Network, found_instances, predicted_normals
 from relit.conventions import similarity
@@ -14,6 +13,7 @@ from relit.errors import UserError
 from relit.evaluate.duplicates import photo_figure
 from relit.job import Job, open_as
 from relit.scene import Asset, Camera, Instance, Material, Mesh
+from support.tiny_onnx import write_pointwise
 
 W, H = 160, 96
 

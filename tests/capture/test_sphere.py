@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import shots
 
 from relit.capture import sphere as s
 from relit.conventions import move_pose, similarity
 from relit.errors import UserError
 from relit.geometry.se3 import exp_so3, look_at
 from relit.scene import Camera, Sphere
+from support import camera_ring
 
 
 def object_points():
     d = np.random.default_rng(0).normal(size=(200, 3))
-    d *= shots.RADIUS / np.linalg.norm(d, axis=1, keepdims=True)
-    return np.concatenate([d + np.asarray(c) for c in shots.BALLS])
+    d *= camera_ring.RADIUS / np.linalg.norm(d, axis=1, keepdims=True)
+    return np.concatenate([d + np.asarray(c) for c in camera_ring.BALLS])
 
 
 def holds(sphere, points, low, high):
@@ -25,7 +25,7 @@ def holds(sphere, points, low, high):
 
 
 def views(cameras):
-    return [s.View(c, mask=shots.picture(c)[1]) for c in cameras]
+    return [s.View(c, mask=camera_ring.picture(c)[1]) for c in cameras]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -34,7 +34,7 @@ def test_from_masks_in_any_frame(seed):
     b_from_a = similarity(
         exp_so3(rng.normal(size=3)), rng.normal(size=3) * 10, 0.03 if seed else 70.0
     )
-    cameras = shots.ring(8)
+    cameras = camera_ring.ring(8)
     moved = [
         s.View(v.camera.with_pose(move_pose(b_from_a, v.camera.world_from_camera)), mask=v.mask)
         for v in views(cameras)
@@ -48,28 +48,30 @@ def test_from_masks_in_any_frame(seed):
 def test_from_masks_of_a_lens_and_of_pictures_that_cut_the_object():
     from relit.geometry.lens import BrownLens
 
-    close = [replace(c, fx=c.fx * 1.6, fy=c.fy * 1.6) for c in shots.ring(12)]
+    close = [replace(c, fx=c.fx * 1.6, fy=c.fy * 1.6) for c in camera_ring.ring(12)]
     holds(s.sphere_from_masks(views(close)), object_points(), 0.55, 1.02)
     lens = BrownLens((0.0, 0.0, 0.0, 0.0))
-    plain = s.sphere_from_masks(views(shots.ring(8)))
-    through = s.sphere_from_masks([s.View(v.camera, lens, v.mask) for v in views(shots.ring(8))])
+    plain = s.sphere_from_masks(views(camera_ring.ring(8)))
+    through = s.sphere_from_masks(
+        [s.View(v.camera, lens, v.mask) for v in views(camera_ring.ring(8))]
+    )
     np.testing.assert_allclose(through.centre, plain.centre)
 
 
 def test_one_bad_mask_of_many_does_not_matter():
-    good = views(shots.ring(24))
+    good = views(camera_ring.ring(24))
     bad = [s.View(good[0].camera, mask=np.roll(good[0].mask, 30, axis=1)), *good[1:]]
     holds(s.sphere_from_masks(bad), object_points(), 0.55, 1.0)
 
 
 def test_masks_of_different_places():
-    good = views(shots.ring(6))
+    good = views(camera_ring.ring(6))
     with pytest.raises(UserError, match="no place in common"):
         s.sphere_from_masks([replace_mask(v, i) for i, v in enumerate(good)])
 
 
 def test_the_masks_that_miss_the_object_are_named():
-    good = views(shots.ring(10))
+    good = views(camera_ring.ring(10))
     wrong = np.zeros_like(good[3].mask)
     wrong[:6, :6] = 1
     named = [
@@ -89,7 +91,7 @@ def replace_mask(view, i):
 
 def test_from_points_of_a_turntable():
     points = np.concatenate([object_points(), [[40.0, 0, 0]]])
-    sphere, source = s.find_sphere([s.View(c) for c in shots.ring()], points)
+    sphere, source = s.find_sphere([s.View(c) for c in camera_ring.ring()], points)
     assert source == "the sparse points"
     holds(sphere, points[:-1], 0.8, 0.95)
 
@@ -97,7 +99,7 @@ def test_from_points_of_a_turntable():
 def test_from_rays_with_a_background():
     rng = np.random.default_rng(0)
     room = rng.uniform(-20, 20, (3000, 3))
-    cameras = shots.ring(10, focal=100.0)
+    cameras = camera_ring.ring(10, focal=100.0)
     sphere, source = s.find_sphere([s.View(c) for c in cameras], room)
     assert source == "the cameras' viewing directions"
     np.testing.assert_allclose(sphere.centre, 0, atol=0.15)
@@ -106,7 +108,7 @@ def test_from_rays_with_a_background():
 
 def test_the_longer_side_of_the_pictures_counts():
     """A tall object in upright photos is held from top to bottom."""
-    square = shots.ring(10, focal=100.0)
+    square = camera_ring.ring(10, focal=100.0)
     upright = [replace(c, height=2 * c.height, cy=2 * c.cy) for c in square]
     small, large = s.sphere_from_rays(square).radius, s.sphere_from_rays(upright).radius
     distance = np.linalg.norm(square[0].centre)
@@ -117,7 +119,7 @@ def test_the_longer_side_of_the_pictures_counts():
 
 
 def test_a_stray_camera_does_not_move_the_sphere():
-    cameras = shots.ring(9)
+    cameras = camera_ring.ring(9)
     stray = cameras[0].with_pose(look_at([4, 0, 0], [4, 30, 10]))
     np.testing.assert_allclose(s.sphere_from_rays([stray, *cameras[1:]]).centre, 0, atol=0.15)
 
@@ -136,7 +138,7 @@ def test_a_pose_with_senseless_numbers_is_no_crash(value):
 
 
 def test_cameras_that_look_outwards():
-    cameras = [c.with_pose(look_at(c.centre, 2 * c.centre)) for c in shots.ring()]
+    cameras = [c.with_pose(look_at(c.centre, 2 * c.centre)) for c in camera_ring.ring()]
     with pytest.raises(UserError, match="look away from each other"):
         s.sphere_from_rays(cameras)
 
@@ -150,7 +152,7 @@ def test_smallest_ball():
 
 
 def test_a_given_sphere_is_checked():
-    cameras = shots.ring()
+    cameras = camera_ring.ring()
     assert s.check_sphere(Sphere(np.zeros(3), 1.0), cameras) == []
     assert "cameras stand inside" in s.check_sphere(Sphere(np.zeros(3), 10.0), cameras)[0]
     with pytest.raises(UserError, match="outside the view of"):
@@ -172,6 +174,7 @@ def test_up_from_level_cameras(up):
 def test_no_up_from_rolled_cameras():
     rng = np.random.default_rng(0)
     cameras = [
-        c.with_pose(look_at(c.centre, np.zeros(3), rng.normal(size=3))) for c in shots.ring(20)
+        c.with_pose(look_at(c.centre, np.zeros(3), rng.normal(size=3)))
+        for c in camera_ring.ring(20)
     ]
     assert s.up_direction(cameras) is None

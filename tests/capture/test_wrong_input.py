@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import shots
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -16,6 +15,7 @@ from relit.capture.readers.middlebury import parse
 from relit.cli import main as cli
 from relit.errors import EXIT_INPUT, EXIT_USAGE, UserError
 from relit.scene import Sphere
+from support import camera_ring
 
 
 def refused(path, match, **options):
@@ -51,7 +51,7 @@ def test_no_images_says_what_was_looked_for(tmp_path):
 
 
 def test_one_image(tmp_path):
-    shots.write_photos(tmp_path, shots.ring(1))
+    camera_ring.write_photos(tmp_path, camera_ring.ring(1))
     refused(tmp_path, "1 photo is not enough: at least 3")
 
 
@@ -67,17 +67,17 @@ def test_photos_cannot_be_shrunk_to_nothing(capture_folder, capsys, side):
 
 
 def test_mixed_sizes(tmp_path, cameras):
-    shots.write_photos(
+    camera_ring.write_photos(
         tmp_path / "images",
         [cameras[0], cameras[1].resized(90, 70), *cameras[2:]],
-        background=shots.BACKGROUND,
+        background=camera_ring.BACKGROUND,
     )
     assert any("2 sizes (5 of 72 x 56, 1 of 90 x 70)" in n for n in open_capture(tmp_path).notes)
-    shots.write_photos(
-        tmp_path / "images", [cameras[0].resized(56, 72)], background=shots.BACKGROUND
+    camera_ring.write_photos(
+        tmp_path / "images", [cameras[0].resized(56, 72)], background=camera_ring.BACKGROUND
     )
     names = [f"images/{i:03d}.png" for i in range(6)]
-    shots.write_transforms(tmp_path, cameras, names)
+    camera_ring.write_transforms(tmp_path, cameras, names)
     refused(tmp_path, "different shapes: 72 x 56 and 56 x 72")
 
 
@@ -129,7 +129,7 @@ def _made(folder):
 def test_missing_masks(capture_folder, cameras):
     for i in range(4):
         images.write_data(
-            _made(capture_folder / "masks") / f"{i:03d}.png", shots.picture(cameras[i])[1]
+            _made(capture_folder / "masks") / f"{i:03d}.png", camera_ring.picture(cameras[i])[1]
         )
     error = refused(capture_folder, "2 of 6 photos have no mask, for example images/004.png")
     assert "masks/" in error.why
@@ -138,22 +138,27 @@ def test_missing_masks(capture_folder, cameras):
 
 def test_inverted_masks_are_turned_with_a_note(capture_folder, cameras):
     for i, camera in enumerate(cameras):
-        images.write_data(_made(capture_folder / "mask") / f"{i}.png", 1 - shots.picture(camera)[1])
+        images.write_data(
+            _made(capture_folder / "mask") / f"{i}.png", 1 - camera_ring.picture(camera)[1]
+        )
     capture = open_capture(capture_folder)
     assert any("inverted" in n for n in capture.notes)
     np.testing.assert_allclose(
-        capture.photos[2].load().mask, shots.picture(cameras[2])[1], atol=0.01
+        capture.photos[2].load().mask, camera_ring.picture(cameras[2])[1], atol=0.01
     )
 
 
 def test_masks_of_0_and_1_are_read_with_a_note(capture_folder, cameras):
     for i, camera in enumerate(cameras):
         images.write_data(
-            _made(capture_folder / "masks") / f"{i:03d}.png", (shots.picture(camera)[1] > 0.5) / 255
+            _made(capture_folder / "masks") / f"{i:03d}.png",
+            (camera_ring.picture(camera)[1] > 0.5) / 255,
         )
     capture = open_capture(capture_folder)
     assert any("numbers 0 and 1" in n for n in capture.notes)
-    np.testing.assert_array_equal(capture.photos[2].load().mask, shots.picture(cameras[2])[1] > 0.5)
+    np.testing.assert_array_equal(
+        capture.photos[2].load().mask, camera_ring.picture(cameras[2])[1] > 0.5
+    )
 
 
 def test_masks_of_the_pixels_as_stored_are_turned_with_their_photo(tmp_path, cameras):
@@ -163,26 +168,26 @@ def test_masks_of_the_pixels_as_stored_are_turned_with_their_photo(tmp_path, cam
     exif = PilImage.Exif()
     exif[0x0112] = 6
     (tmp_path / "images").mkdir()
-    stored = [np.rot90(shots.picture(c)[i], 1) for c in cameras for i in (0, 1)]
+    stored = [np.rot90(camera_ring.picture(c)[i], 1) for c in cameras for i in (0, 1)]
     for i in range(6):
         codes = (np.clip(stored[2 * i] ** (1 / 2.2), 0, 1) * 255).astype(np.uint8)
         PilImage.fromarray(codes).save(tmp_path / "images" / f"{i}.jpg", exif=exif, quality=97)
         images.write_data(_made(tmp_path / "masks") / f"{i}.png", stored[2 * i + 1])
     photo = open_capture(tmp_path).photos[1]
     assert (photo.width, photo.height) == (72, 56)
-    np.testing.assert_allclose(photo.load().mask, shots.picture(cameras[1])[1], atol=0.01)
+    np.testing.assert_allclose(photo.load().mask, camera_ring.picture(cameras[1])[1], atol=0.01)
 
 
 def test_an_inverted_alpha_channel(tmp_path, cameras):
     for i, camera in enumerate(cameras):
-        rgb, alpha = shots.picture(camera)
+        rgb, alpha = camera_ring.picture(camera)
         images.write_srgb(tmp_path / f"{i}.png", np.concatenate([rgb, 1 - alpha[..., None]], -1))
     refused(tmp_path, "alpha channel looks inverted")
 
 
 def test_an_opaque_alpha_channel_is_no_mask(tmp_path, cameras):
     for i, camera in enumerate(cameras):
-        rgb, alpha = shots.picture(camera)
+        rgb, alpha = camera_ring.picture(camera)
         background = np.random.default_rng(i).uniform(size=rgb.shape) * (1 - alpha[..., None])
         images.write_srgb(
             tmp_path / f"{i}.png",
@@ -206,7 +211,8 @@ def test_a_photo_with_an_empty_mask_is_left_out_with_a_note(capture_folder, came
     monkeypatch.setattr(opening, "SMALL", 40)  # masks are judged on small copies
     for i, camera in enumerate(cameras):
         images.write_data(
-            _made(capture_folder / "masks") / f"{i:03d}.png", shots.picture(camera)[1] * (i != 2)
+            _made(capture_folder / "masks") / f"{i:03d}.png",
+            camera_ring.picture(camera)[1] * (i != 2),
         )
     capture = open_capture(capture_folder)
     assert len(capture.photos) == 5 and any(
@@ -225,18 +231,22 @@ def test_masks_asked_for_but_not_there(capture_folder):
 
 def test_grabcut_on_request(capture_folder, cameras):
     capture = open_capture(capture_folder, masks="grabcut")
-    mask, truth = capture.photos[0].load().mask, shots.picture(cameras[0])[1]
+    mask, truth = capture.photos[0].load().mask, camera_ring.picture(cameras[0])[1]
     assert ((mask > 0.5) & (truth > 0.5)).sum() > 0.6 * (truth > 0.5).sum()
     assert any("GrabCut" in n for n in capture.notes)
 
 
 def test_truncated_jpeg_and_nan(tmp_path):
-    shots.write_photos(tmp_path, shots.ring(4), suffix=".jpg", background=shots.BACKGROUND)
+    camera_ring.write_photos(
+        tmp_path, camera_ring.ring(4), suffix=".jpg", background=camera_ring.BACKGROUND
+    )
     whole = (tmp_path / "002.jpg").read_bytes()
     (tmp_path / "002.jpg").write_bytes(whole[: len(whole) // 2])
     refused(tmp_path, "cannot be read")
     exr = tmp_path / "exr"
-    shots.write_photos(exr, shots.ring(4), suffix=".exr", background=shots.BACKGROUND)
+    camera_ring.write_photos(
+        exr, camera_ring.ring(4), suffix=".exr", background=camera_ring.BACKGROUND
+    )
     images.write_linear(exr / "001.exr", np.full((56, 72, 3), np.inf))
     refused(exr, "NaN or infinite")
 
@@ -315,9 +325,11 @@ KEYS = [
 )
 def test_any_json_is_read_or_refused(tmp_path, head, first):
     if not (tmp_path / "images").exists():
-        shots.write_photos(tmp_path / "images", shots.ring(3), background=shots.BACKGROUND)
-    cameras = shots.ring(3)
-    shots.write_transforms(tmp_path, cameras, [f"images/{i:03d}.png" for i in range(3)])
+        camera_ring.write_photos(
+            tmp_path / "images", camera_ring.ring(3), background=camera_ring.BACKGROUND
+        )
+    cameras = camera_ring.ring(3)
+    camera_ring.write_transforms(tmp_path, cameras, [f"images/{i:03d}.png" for i in range(3)])
 
     def change(data):
         data["frames"][0].update(first)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import trimesh
-from reference.sdf import eikonal_energy
 
 from relit.errors import UserError
 from relit.fit.passes.volume import next_level, start_model
@@ -21,6 +20,7 @@ from relit.geometry.sdf import (
     smoothness_gradient,
 )
 from relit.scene import Camera
+from support.twins.sdf import eikonal_energy
 
 
 def ball(n: int, radius: float) -> np.ndarray:

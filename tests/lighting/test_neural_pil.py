@@ -9,6 +9,7 @@ import pytest
 from relit.errors import UserError
 from relit.lighting.neural_pil import CODE, SHAPES, load_neural_pil
 from relit.lighting.per_photo import COLUMNS, ROWS, TEXELS, log_lights, mean_level
+from support.neural_pil_files import write_network
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "weights" / "neural_pil"
 REAL = (
@@ -16,20 +17,6 @@ REAL = (
     if REAL.is_dir()
     else Path(__file__).parents[3] / "shared" / "data" / "weights" / "neural_pil"
 )
-
-
-def write_network(folder, shapes=SHAPES, seed=0):
-    rng = np.random.default_rng(seed)
-    arrays = {
-        f"w{i:02d}": (rng.normal(size=s) / np.sqrt(s[0])).astype(np.float32)
-        for i, s in enumerate(shapes)
-    }
-    arrays["w09"] = np.ones(3, np.float32)
-    np.savez(folder / "illumination-network_network.npz", **arrays)
-    np.save(
-        folder / "illumination_latent_mean_std.npy",
-        np.stack([np.zeros(CODE), np.ones(CODE)]).astype(np.float32),
-    )
 
 
 def test_lights_and_their_derivative(tmp_path):

@@ -5,9 +5,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from reference import brdf as twin
 
 from relit.materials import brdf
+from support.twins import brdf as twin
 
 MATERIALS = [  # base colour, roughness, metallic
     ((0.8, 0.4, 0.1), 0.2, 0.0),

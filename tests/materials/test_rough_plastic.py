@@ -15,7 +15,7 @@ from relit.materials.rough_plastic import (
     sample,
     transmittance_tables,
 )
-from tests.reference.rough_plastic import plastic
+from support.twins.rough_plastic import plastic
 
 
 def directions(count: int = 400):

@@ -5,10 +5,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from reference import march as twin
 
 from relit.geometry.sdf import make_grid, node_positions
 from relit.rendering.march import march, sphere_interval
+from support.twins import march as twin
 
 N, RAYS = 16, 64
 STEPS = {
@@ -255,7 +255,7 @@ def test_the_adjoint_itself_is_exact(monkeypatch, name):
     Rays that move see the trilinear normal jump from cell to cell, which is no part of its
     derivative: where everything is moved along the sign of the gradient the normal's share is up to
     40 % short. So origins and directions are tested on the other outputs; a field whose normal does
-    not jump is in tests/fit/test_gradients.py.
+    not jump is in tests/fit/passes/test_gradients.py.
     """
     monkeypatch.setattr("relit.rendering.march.MIN_ALPHA", 0.0)
     p = (

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from looking import HEIGHT, WIDTH, lopsided, serve
 
 from relit.asset.asset import save_asset
 from relit.conventions import move_points, similarity
@@ -20,8 +19,9 @@ from relit.reference.mitsuba_scene import build_scene, render
 from relit.scene import Asset, Camera
 from relit.synthesize.procedural import pawn
 from relit.viewer.page import PAGE
+from support import ROOT
+from support.browser import HEIGHT, WIDTH, lopsided, serve
 
-ROOT = Path(__file__).resolve().parents[2]
 CHROMIUM = next(
     (p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None
 )

@@ -4,15 +4,11 @@ painted in the page."""
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from looking import READY, serve
-from test_serve import ask
 
 from relit.capture.corrections import FOLDER, save_mask, save_sphere, sphere_from_boxes
 from relit.capture.open import open_capture
@@ -20,9 +16,9 @@ from relit.errors import UserError
 from relit.job import Job, input_digests, open_input
 from relit.scene import Sphere
 from relit.viewer.correct import correction_server
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from test_faults import black_masks, photos_only, picture, write_capture
+from support.browser import READY, serve
+from support.http_client import ask
+from support.striped_ball import black_masks, photos_only, picture, write_capture
 
 
 @pytest.fixture

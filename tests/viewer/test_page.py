@@ -9,13 +9,13 @@ import shutil
 
 import numpy as np
 import pytest
-from looking import HEIGHT, READY, WIDTH, lopsided, psnr, serve
 from PIL import Image
 
 from relit.conventions import rotate_environment, srgb_from_linear
 from relit.images import write_linear
 from relit.reference.mitsuba_scene import build_scene, render, render_channels
 from relit.run import Run
+from support.browser import HEIGHT, READY, WIDTH, lopsided, psnr, serve
 
 SIZE = f"relit.viewer.resize({WIDTH}, {HEIGHT}, 1)"
 PICTURE = "relit.viewer.canvas.toDataURL()"

@@ -9,7 +9,6 @@ from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
-from looking import serve
 
 from relit.capture.open import open_capture
 from relit.capture.readers.samurai import direction_of, quadrant_of, read_hints
@@ -17,6 +16,7 @@ from relit.errors import UserError
 from relit.images import write_srgb
 from relit.viewer import quadrants
 from relit.viewer.quadrants import answers_of, ask_in_terminal, guesses_of, keys_of, quadrant_server
+from support.browser import serve
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@ told."""
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
 import shutil
@@ -19,20 +18,7 @@ from relit.viewer.manifest import curves, is_held, manifest, status
 from relit.viewer.page import SLOT, page_text, page_with
 from relit.viewer.photos import write_photos
 from relit.viewer.serve import run_server
-
-
-def ask(server, path, method="GET", body=None, **headers):
-    connection = http.client.HTTPConnection(*server.server_address, timeout=10)
-    connection.putrequest(method, path, skip_host="Host" in headers)
-    for key, value in headers.items():
-        connection.putheader(key.replace("_", "-"), value)
-    if body is not None:
-        connection.putheader("Content-Length", str(len(body)))
-    connection.endheaders(body)
-    answer = connection.getresponse()
-    content = answer.read()
-    connection.close()
-    return answer.status, content, dict(answer.getheaders())
+from support.http_client import ask
 
 
 def test_it_listens_on_loopback_only(server):

@@ -1,0 +1,1 @@
+"""Plain NumPy twins of kernels, which the tests compare with."""
