@@ -19,8 +19,9 @@ from relit.files import parse_toml  # noqa: E402
 
 HEAD = """# Dependencies and their licences
 
-Written by `tools/licences.py` from what is installed. Relit itself: Apache-2.0 (LICENSE). Nothing of these is copied into the repository;
-the page that the wheel carries has three.js and three-mesh-bvh built in, with their notices at its top.
+Written by `tools/licences.py` from the installed packages. Relit itself: Apache-2.0 (LICENSE).
+No code of these packages is copied into the repository. The page in the wheel contains three.js and
+three-mesh-bvh, with their notices at its top.
 """
 
 # What their projects say, where the distribution does not or is an extra that need not be
