@@ -14,8 +14,8 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / "relit"
 # Packages from the ground up. A module may import modules of lower rows, and of its own package.
 ROWS = [
     ["errors", "conventions", "__init__"],
-    ["images", "log", "files", "run", "settings", "device"],
-    ["scene"],
+    ["images", "log", "files", "records", "run", "settings", "device"],
+    ["scene", "recipe"],
     ["geometry", "materials", "lighting", "masks"],
     ["capture/readers", "capture"],
     ["cameras"],

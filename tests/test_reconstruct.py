@@ -18,6 +18,7 @@ from relit.cli import main as cli
 from relit.errors import UserError
 from relit.files import parse_toml
 from relit.job import Job, check_memory, estimate, open_input
+from relit.recipe import Recipe
 from relit.report import page as report
 from relit.scene import Asset
 from relit.synthesize.procedural import pawn, studio
@@ -50,7 +51,7 @@ def quick(monkeypatch):
             mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos)
         )
 
-    monkeypatch.setattr(multiview, "reconstruct", fit)
+    monkeypatch.setattr(multiview, "RECIPE", replace(multiview.RECIPE, run=fit))
 
 
 STOP: list[BaseException] = []
@@ -108,7 +109,7 @@ def test_a_signal_inside_a_native_loop_is_still_a_stop(
             except BaseException as error:
                 raise RuntimeError("dr.while_loop(): encountered an exception") from error
 
-    monkeypatch.setattr(multiview, "reconstruct", fit)
+    monkeypatch.setattr(multiview, "RECIPE", replace(multiview.RECIPE, run=fit))
     before = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
     got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
     assert got == code and "goes on from the checkpoint" in err and "fault of Relit" not in err
@@ -266,7 +267,7 @@ def test_estimate_grows_with_photos_and_quality(capture, monkeypatch):
 
 
 def test_estimate_at_the_measured_capture_is_what_was_measured(capture):
-    from relit.job import MEASURED, MEASURED_PHOTOS
+    from relit.job import MEASURED_PHOTOS, recipe_of
 
     opened = open_input(capture, Job())
     side = {"width": 400, "height": 400}
@@ -279,7 +280,7 @@ def test_estimate_at_the_measured_capture_is_what_was_measured(capture):
             (seconds, memory), rel=0.1
         )  # draft shrinks them
     assert (
-        estimate(replace(sixty, photos=sixty.photos * 2), Job()).seconds > MEASURED["standard"][0]
+        estimate(replace(sixty, photos=sixty.photos * 2), Job()).seconds > recipe_of("multiview").cost["standard"][0]
     )
 
 
@@ -334,15 +335,12 @@ def test_the_layout_of_the_input_chooses_the_recipe(capsys, tmp_path, capture, m
             mesh, material, np.eye(4), studio(8), tuple((p.name, p.camera) for p in capture.photos)
         )
 
-    recipe = types.ModuleType("stand_in_recipe")
-    recipe.options_for, recipe.reconstruct, recipe.LIGHT, recipe.STAGES = (
-        (lambda quality: Options()),
-        fit,
-        "a lamp",
-        ("one",),
+    module = types.ModuleType("stand_in_recipe")
+    cost = {"standard": (7.0, 1.0e9)}
+    module.RECIPE = Recipe(
+        "flash", "a lamp", lambda quality: Options(), fit, ("one",), cost, min_photos=1
     )
-    recipe.LEAST_PHOTOS, recipe.COST = 1, {"standard": (7.0, 1.0e9)}
-    monkeypatch.setitem(sys.modules, "stand_in_recipe", recipe)
+    monkeypatch.setitem(sys.modules, "stand_in_recipe", module)
     opened = plan.open_input(capture, Job())
     monkeypatch.setattr(plan, "open_input", lambda path, job: replace(opened, kind="flash"))
     monkeypatch.delitem(plan.RECIPES, "flash", raising=False)

@@ -11,6 +11,8 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ from relit.files import (
     write_text,
 )
 from relit.log import Log, MemoryWatch, Progress, peak_memory, readable_bytes, readable_seconds
-from relit.run import Run, read_metrics
+from relit.run import RUN_FORMAT, Run, read_metrics
 
 CONFIG = {
     "capture": "multiview",
@@ -109,9 +111,16 @@ def test_a_second_run_in_the_same_process_is_refused_until_the_first_is_closed(t
     Run.open(tmp_path, CONFIG).close()
 
 
+def saved_config(folder: Path) -> dict:
+    """The settings in config.toml, without the format of the run folder."""
+    saved = parse_toml((folder / "config.toml").read_text())
+    assert saved.pop("run_format") == RUN_FORMAT
+    return saved
+
+
 def test_config_is_saved_as_toml_and_read_back(tmp_path):
     with Run.open(tmp_path / "run", CONFIG):
-        assert parse_toml((tmp_path / "run/config.toml").read_text()) == CONFIG
+        assert saved_config(tmp_path / "run") == CONFIG
 
 
 def test_other_settings_are_refused_by_name(tmp_path):
@@ -125,7 +134,7 @@ def test_other_settings_are_refused_by_name(tmp_path):
         and "--overwrite" in text
     )
     assert "rate" not in text
-    assert parse_toml((tmp_path / "config.toml").read_text()) == CONFIG
+    assert saved_config(tmp_path) == CONFIG
 
 
 def test_resume_false_removes_only_what_a_run_made(tmp_path):
@@ -321,3 +330,51 @@ def test_memory_watch_sees_a_stage_below_the_maximum():
 def test_readable():
     assert [readable_seconds(s) for s in (8.2, 200, 7500)] == ["8 s", "3 min 20 s", "2 h 5 min"]
     assert readable_bytes(3.4e9) == "3.4 GB" and readable_bytes(8.12e8) == "812 MB"
+
+
+def test_a_run_folder_of_another_version_is_refused(tmp_path):
+    Run.open(tmp_path, CONFIG).close()
+    text = (tmp_path / "config.toml").read_text()
+    for other in ("", "run_format = 99\n"):
+        (tmp_path / "config.toml").write_text(
+            other + "".join(x + "\n" for x in text.splitlines() if "run_format" not in x)
+        )
+        with pytest.raises(UserError, match="another version") as caught:
+            Run.open(tmp_path, CONFIG)
+        assert "--overwrite" in str(caught.value)
+    Run.open(tmp_path, CONFIG, resume=False).close()
+
+
+@dataclass(frozen=True)
+class Squares:
+    values: np.ndarray
+    largest: float
+
+
+def test_a_cached_stage_is_computed_once(tmp_path):
+    calls = []
+
+    def compute(stage):
+        calls.append(stage.name)
+        values = np.arange(4.0) ** 2
+        return Squares(values, float(values.max()))
+
+    for _ in range(2):
+        with Run.open(tmp_path, CONFIG) as run:
+            result = run.cached("squares", Squares, compute, title="squares of numbers")
+            assert result.largest == 9.0 and result.values.tolist() == [0, 1, 4, 9]
+    assert calls == ["squares"]
+    (tmp_path / "stages/squares/result.npz").write_bytes(b"damaged")
+    with Run.open(tmp_path, CONFIG) as run, pytest.raises(UserError, match="cannot be read"):
+        run.cached("squares", Squares, compute)
+
+
+def test_a_cached_stage_that_is_stopped_is_computed_again(tmp_path):
+    def stopped(stage):
+        raise KeyboardInterrupt
+
+    with Run.open(tmp_path, CONFIG) as run, pytest.raises(KeyboardInterrupt):
+        run.cached("squares", Squares, stopped)
+    with Run.open(tmp_path, CONFIG) as run:
+        result = run.cached("squares", Squares, lambda stage: Squares(np.zeros(1), 0.0))
+    assert result.largest == 0.0

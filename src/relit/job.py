@@ -8,7 +8,6 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
@@ -16,14 +15,11 @@ from relit.capture.flash_energy import flash_photos
 from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError, did_you_mean
 from relit.files import digests
 from relit.log import available_memory, readable_bytes
+from relit.recipe import Recipe
 from relit.scene import Capture, Photo, Sphere
 from relit.settings import read_config, with_values
 
-# The recipe of each kind of capture: a module with options_for(quality) and reconstruct(capture,
-# run, options, seed) -> Asset, and LIGHT (a phrase) and STAGES (names) for `relit inspect`. It may
-# also hold FINDS_CAMERAS = True (photos without cameras come to it as they are; otherwise structure
-# from motion has found them), LEAST_PHOTOS (3 where absent), COST (see MEASURED), COST_OBJECTS (see
-# `estimate`).
+# The module of each kind of capture that holds its RECIPE (`relit.recipe.Recipe`).
 RECIPES = {
     "multiview": "relit.fit.multiview.recipe",
     "flash": "relit.fit.flash.recipe",
@@ -40,7 +36,7 @@ JOB_KEYS = {
     "focal": float,
     "sphere": list,
 }
-WRITTEN_KEYS = {"input", "relit", "settings"}  # what config.toml holds besides
+WRITTEN_KEYS = {"input", "relit", "run_format", "settings"}  # what config.toml holds besides
 
 
 @dataclass(frozen=True)
@@ -85,9 +81,9 @@ def capture_kind(asked: str) -> str:
     raise UserError(what, f"kinds that are reconstructed: {', '.join(RECIPES)}", code=EXIT_USAGE)
 
 
-def recipe_of(kind: str) -> ModuleType:
-    """The recipe's module. It may be imported before a device is chosen."""
-    return importlib.import_module(RECIPES[kind])
+def recipe_of(kind: str) -> Recipe:
+    """The recipe of a kind of capture. It may be imported before a device is chosen."""
+    return importlib.import_module(RECIPES[kind]).RECIPE
 
 
 def open_input(path: Path, job: Job) -> Capture:
@@ -107,11 +103,7 @@ def open_input(path: Path, job: Job) -> Capture:
         if job.sphere is None
         else Sphere(np.array(job.sphere[:3], dtype=np.float64), float(job.sphere[3]))
     )
-    least = (
-        {}
-        if job.capture not in RECIPES
-        else {"min_photos": getattr(recipe_of(job.capture), "LEAST_PHOTOS", 3)}
-    )
+    least = {} if job.capture not in RECIPES else {"min_photos": recipe_of(job.capture).min_photos}
     labels = job.capture in (
         "auto",
         "duplicates",
@@ -227,9 +219,7 @@ class Cost:
     disk: float
 
 
-# Whole jobs on 2 cores with 60 photos of 400x400, cold start: (seconds, peak bytes) by quality, and
-# what more photos or pixels add.
-MEASURED = {"draft": (50.0, 0.9e9), "standard": (250.0, 2.1e9), "high": (1000.0, 3.0e9)}
+# What more photos or pixels add to a recipe's cost.
 MEASURED_PHOTOS, MEASURED_PIXELS = 60, 400 * 400
 SECONDS_PER_PHOTO = {"cameras": 3.0, "load": 0.05}
 BYTES_PER_PIXEL = 40.0  # a decoded photo and its share of the pixel bank
@@ -240,19 +230,17 @@ def estimate(capture: Capture, job: Job, kind: str = "multiview", options=None) 
     before the job, so that it can be refused.
 
     options: of the recipe, by default those of the quality; photos are shrunk until all together
-    have no more than its `max_pixels`. The recipe's COST_OBJECTS: identical objects that its COST
-    was measured with, and what each more adds, as shares of time and memory.
+    have no more than its `max_pixels`.
     """
     recipe = recipe_of(kind)
     pixels = sum(p.width * p.height for p in capture.photos)
-    pixels = min(pixels, getattr(options or recipe.options_for(job.quality), "max_pixels", pixels))
-    seconds, memory = getattr(recipe, "COST", MEASURED)[job.quality]
-    if capture.objects and hasattr(recipe, "COST_OBJECTS"):
-        usual, time_share, memory_share = recipe.COST_OBJECTS
-        seconds *= 1 + time_share * (capture.objects - usual)
-        memory *= 1 + memory_share * (capture.objects - usual)
+    pixels = min(pixels, getattr(options or recipe.options(job.quality), "max_pixels", pixels))
+    seconds, memory = recipe.cost[job.quality]
+    if capture.objects and (each := recipe.object_cost) is not None:
+        seconds *= 1 + each.seconds * (capture.objects - each.measured_with)
+        memory *= 1 + each.memory * (capture.objects - each.measured_with)
     seconds += (len(capture.photos) - MEASURED_PHOTOS) * SECONDS_PER_PHOTO["load"]
-    if not capture.has_cameras and not getattr(recipe, "FINDS_CAMERAS", False):
+    if not capture.has_cameras and not recipe.finds_cameras:
         seconds += len(capture.photos) * SECONDS_PER_PHOTO["cameras"]
     largest = max((p.width * p.height for p in capture.photos), default=0)
     memory += BYTES_PER_PIXEL * (pixels + 2 * largest - (MEASURED_PHOTOS + 2) * MEASURED_PIXELS)

@@ -60,7 +60,7 @@ def reconstruct(
     chosen = use_device(device)
     capture, kind = open_as(Path(input), job)
     recipe = recipe_of(kind)
-    options = with_values(recipe.options_for(job.quality), from_file, f"--config {config}")
+    options = with_values(recipe.options(job.quality), from_file, f"--config {config}")
     options = with_values(with_pairs(options, pairs), settings or {}, "settings")
     cost = estimate(capture, job, kind, options)
     check_memory(cost)
@@ -83,10 +83,10 @@ def reconstruct(
 
             check_flash_light(capture, run.say)
         given = capture  # photos whose cameras are not found are left out of what follows
-        if not getattr(recipe, "FINDS_CAMERAS", False):
+        if not recipe.finds_cameras:
             capture = with_cameras(capture, run, job)
         if not finished:
-            asset = recipe.reconstruct(capture, run, options, job.seed)
+            asset = recipe.run(capture, run, options, job.seed)
             unchanged(run, given)
             _save(run, asset, capture, kind, job, chosen)
         if not (run.folder / "photos" / "index.json").is_file():

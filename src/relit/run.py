@@ -19,6 +19,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -34,6 +35,9 @@ from relit.files import (
     write_text,
 )
 from relit.log import Log, MemoryWatch, Progress, readable_bytes, readable_seconds
+from relit.records import from_arrays, to_arrays
+
+T = TypeVar("T")
 
 CHECKPOINT_SECONDS = (
     20.0  # a checkpoint is due this long after the last one, later if writing one is slow
@@ -42,6 +46,7 @@ CHECKPOINT_LONGEST = 60.0  # ... but never later than this
 PREVIEW_SECONDS = 10.0  # between two previews of a stage
 METRICS_SECONDS = 0.5  # between two lines of metrics.jsonl
 FILES = ("config.toml", "inputs.json", "evaluation.json", "log.txt", "metrics.jsonl", "report.html")
+RUN_FORMAT = 2  # of the stages' results; a run folder of another format is refused
 OWNED = (*FILES, "stages", "previews", "photos", "asset")
 
 
@@ -81,6 +86,7 @@ class Run:
         settings or inputs differ.
         """
         folder = Path(folder)
+        config = {"run_format": RUN_FORMAT, **config}
         wanted = parse_toml(toml_text(config))
         with disk_errors(folder):
             _refuse_foreign(folder)
@@ -179,6 +185,30 @@ class Run:
         self.say(
             f"{stage.title}: {readable_seconds(stage.seconds)}, peak memory {readable_bytes(peak)}"
         )
+
+    def cached(
+        self,
+        name: str,
+        kind: type[T],
+        compute: Callable[[Stage], T],
+        *,
+        title: str | None = None,
+        steps: int | None = None,
+    ) -> T:
+        """The result of a stage: computed by `compute(stage)` and kept, or read back when done.
+
+        kind: its type, a frozen dataclass (see `relit.records`). title, steps: see `stage`.
+        Raises UserError where the result of a finished stage cannot be read.
+        """
+        if not self.done(name):
+            with self.stage(name, steps=steps, title=title) as stage:
+                result = compute(stage)
+                stage.save("result", **to_arrays(result))
+            return result
+        try:
+            return from_arrays(kind, run_arrays(self, name, "result"))
+        except (LookupError, ValueError, TypeError) as error:
+            raise _unreadable_result(name, error, self.folder) from None
 
     def stages(self) -> list[dict]:
         """The finished stages in the order in which they ended: name, title, seconds, peak_memory
@@ -294,11 +324,15 @@ def run_arrays(run: Run, stage: str, name: str) -> dict[str, np.ndarray]:
     try:
         return load_arrays(path)
     except NO_ARRAYS as error:
-        what = f"what the finished stage '{stage}' has kept cannot be read ({type(error).__name__})"
-        why = "the file was damaged or removed; later stages were computed from it"
-        raise UserError(
-            what, why, f"give the same command with --overwrite to begin anew: {path}"
-        ) from None
+        raise _unreadable_result(stage, error, path) from None
+
+
+def _unreadable_result(stage: str, error: Exception, path: Path) -> UserError:
+    return UserError(
+        f"the result of the finished stage '{stage}' cannot be read ({type(error).__name__})",
+        "the file was damaged or removed; later stages were computed from it",
+        f"give the same command with --overwrite to begin anew: {path}",
+    )
 
 
 def read_stages(folder: Path) -> list[dict]:
@@ -413,6 +447,14 @@ def _compare(folder: Path, wanted: dict, inputs: dict[str, str] | None) -> None:
             f"the run's config.toml cannot be read: {error}",
             fix=f"use another -o, or --overwrite: {path}",
         ) from None
+    if saved.get("run_format", 1) != RUN_FORMAT:
+        raise UserError(
+            "the run folder was made by another version of Relit, whose stages cannot be resumed",
+            f"its format is {saved.get('run_format', 1)}, this version's is {RUN_FORMAT}; "
+            "a finished asset in it can still be viewed, relit and exported",
+            f"use another -o, or --overwrite to begin anew: {path}",
+            code=EXIT_USAGE,
+        )
     a, b = _flat(saved), _flat(wanted)
     keys = [k for k in dict.fromkeys([*a, *b]) if a.get(k) != b.get(k)]
     if keys:

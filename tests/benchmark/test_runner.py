@@ -85,7 +85,7 @@ def test_a_suite_names_what_there_is(name):
         assert set(options) <= set(keywords)
     for words in suite.ablations.values():
         with_pairs(
-            recipe_of(suite.kind).options_for("standard"),
+            recipe_of(suite.kind).options("standard"),
             [w for w in words if not w.startswith("--")],
         )
     assert all(bar[0] in (">=", "<=") for bar in (*suite.bars.values(), *suite.draft_bars.values()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -218,7 +219,7 @@ def test_the_light_is_looked_at_before_a_flash_reconstruction(tmp_path, monkeypa
     def stop(*args):
         raise GoesOn
 
-    monkeypatch.setattr(recipe, "reconstruct", stop)
+    monkeypatch.setattr(recipe, "RECIPE", replace(recipe.RECIPE, run=stop))
     for name, light in (("room", fixed), ("flash", flash)):
         (tmp_path / name).mkdir()
         with_alpha(tmp_path / name, light)

@@ -35,7 +35,7 @@ def inspect(
     if plot is not None:
         write_plot(plot, capture)
     cost = estimate(capture, job, kind)
-    finds_cameras = capture.has_cameras or getattr(recipe, "FINDS_CAMERAS", False)
+    finds_cameras = capture.has_cameras or recipe.finds_cameras
     sizes = sorted({(p.width, p.height) for p in capture.photos})
     ball = capture.sphere and {
         "centre": [float(x) for x in capture.sphere.centre],
@@ -59,12 +59,12 @@ def inspect(
         "reprojection": reprojection(capture, looks),
         "masks": masks,
         "capture": kind,
-        "light": recipe.LIGHT,
+        "light": recipe.light,
         "light_regime": regime,
         "drift": drifts,
         "warnings": [*_of_light(kind, regime), *camera_warnings(epipolar, around), *unsteady],
         "notes": list(capture.notes),
-        "stages": ([] if finds_cameras else ["cameras"]) + [*recipe.STAGES, "asset", "report"],
+        "stages": ([] if finds_cameras else ["cameras"]) + [*recipe.stages, "asset", "report"],
         "estimate": {
             "seconds": round(cost.seconds),
             "memory": round(cost.memory),

@@ -59,14 +59,13 @@ from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.per_photo import COLUMNS, ROWS
 from relit.materials.field import normal_map, pictures, start_material
+from relit.recipe import Recipe
 from relit.rendering.appearance.fixed_light import features_at
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
 from relit.settings import check_levels
 
-__all__ = ["LEAST_PHOTOS", "CollectionOptions", "options_for", "reconstruct"]
-LIGHT = "one light per photo (collection)"
 # most of exchange_rate times steps: the lights are flatter than true ones, and highlights then ask
 # for ever more of them
 EXCHANGE = 14.0
@@ -79,19 +78,6 @@ BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to
 ALIKE = 0.15
 LISTED = 10  # photos that are named at once
 CHECKED = 12  # photos from which on the poses are checked by leaving out half of them
-STAGES = (
-    "links",
-    "poses",
-    "volume",
-    "second_look",
-    "hollows",
-    "opened",
-    "mesh",
-    "surface",
-    "held_out",
-)
-FINDS_CAMERAS = True
-COST = {"draft": (150.0, 1.2e9), "standard": (360.0, 1.8e9), "high": (2500.0, 3.0e9)}
 
 
 def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0) -> Asset:
@@ -428,3 +414,27 @@ def assemble(
         meta,
         lights=tuple(lights),
     )
+
+
+RECIPE = Recipe(
+    name="collection",
+    light="one light per photo (collection)",
+    options=options_for,
+    run=reconstruct,
+    stages=(
+        *("links", "poses", "volume", "second_look", "hollows", "opened", "mesh", "surface"),
+        "held_out",
+    ),
+    cost={"draft": (150.0, 1.2e9), "standard": (360.0, 1.8e9), "high": (2500.0, 3.0e9)},
+    finds_cameras=True,
+    min_photos=LEAST_PHOTOS,
+    ablations={
+        "quadrants": "hints of the directions that photos were taken from",
+        "search": "registration by rendering",
+        "multiplex": "several poses of each photo in the coarse fits (SAMURAI Sec. 3.3)",
+        "posterior": "weights of photos by how well they are explained (SAMURAI Eq. 9)",
+        "coarse_to_fine": "the order of the coarse fits, small photos first",
+        "light_prior": "the prior of natural illumination (SAMURAI, Neural-PIL)",
+        "links": "groups of photos that feature matches connect",
+    },
+)

@@ -38,7 +38,7 @@ from relit.fit.duplicates.azimuth_refinement import SCENES, turned_as_shown
 from relit.fit.duplicates.ground_paint import ground_as_shown
 from relit.fit.duplicates.indirect_light import ASLANT, HiddenLight, hidden_from
 from relit.fit.duplicates.lit_pile import lit_pile, surface_options
-from relit.fit.duplicates.options import DuplicatesOptions, options_for
+from relit.fit.duplicates.options import WITHOUT, DuplicatesOptions, options_for
 from relit.fit.duplicates.poses import all_views, named, poses_stage
 from relit.fit.duplicates.scene import ground_colour, ground_reflectance, light_below
 from relit.fit.duplicates.shape import shape_stages
@@ -52,27 +52,11 @@ from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.se3 import nearest_rotation, rotation_angle, rotation_from
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
+from relit.recipe import ObjectCost, Recipe
 from relit.rendering.transport import NO_TEXELS
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 from relit.settings import check_levels
-
-__all__ = ["DuplicatesOptions", "options_for", "reconstruct"]
-# what `relit inspect` says
-LIGHT = "several identical objects under one light are assumed (duplicates)"
-STAGES = ("poses", "joint", "vessel", "volume", "mesh", "surface", "turns")
-FINDS_CAMERAS = True
-LEAST_PHOTOS = 1
-COST = {
-    "draft": (240.0, 1.9e9),
-    "standard": (540.0, 2.0e9),
-    "high": (1500.0, 3.0e9),
-}  # most of it is the search for poses
-COST_OBJECTS = (
-    10,
-    0.02,
-    0.008,
-)  # objects of that, and what each more adds, as shares of time and of memory
 
 
 def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0) -> Asset:
@@ -315,3 +299,18 @@ def assemble(photos, mesh: Mesh, maps, parts, keys: dict[int, float]) -> Asset:
         instances=tuple(instances),
         ground=ground,
     )
+
+
+RECIPE = Recipe(
+    name="duplicates",
+    light="several identical objects under one light are assumed (duplicates)",
+    options=options_for,
+    run=reconstruct,
+    stages=("poses", "joint", "vessel", "volume", "mesh", "surface", "turns"),
+    # most of it is the search for poses
+    cost={"draft": (240.0, 1.9e9), "standard": (540.0, 2.0e9), "high": (1500.0, 3.0e9)},
+    finds_cameras=True,
+    min_photos=1,
+    object_cost=ObjectCost(measured_with=10, seconds=0.02, memory=0.008),
+    ablations=WITHOUT,
+)

@@ -49,6 +49,7 @@ from relit.masks.threshold import Backdrop
 from relit.materials.plastic_as_gltf import base_colour
 from relit.materials.plastic_field import MOST_SPECULAR, plastic_pictures, start_plastic
 from relit.materials.rough_plastic import IOR, Coat
+from relit.recipe import Recipe
 from relit.rendering.appearance.fixed_light import features_at
 from relit.rendering.appearance.flash_light import FlashAppearance, alpha_on, start_learnt
 from relit.rendering.transport import TraceableMesh
@@ -56,11 +57,6 @@ from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
 from relit.settings import check_levels, check_parts, preset
 
-LIGHT = "a flash that moves with the camera, in a dark room"
-STAGES = ("volume", "mesh", "surface")
-# 120 photos of 400x400 took 217 s and 2.4 GB at standard, half of it the volume pass, half the
-# surface pass; 56 s at draft
-COST = {"draft": (55.0, 0.9e9), "standard": (215.0, 2.0e9), "high": (600.0, 2.8e9)}
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
 COARSE_FACES = 20_000  # of the mesh on which the volume pass's inter-reflection is estimated
 PLACE = 0.15  # how much a unit length counts beside a display value when places are compared
@@ -464,3 +460,22 @@ def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], ior: flo
     return Asset(
         placed, material, world_from_asset, None, cameras, {"material": "rough_plastic"}, flash
     )
+
+
+RECIPE = Recipe(
+    name="flash",
+    light="a flash that moves with the camera, in a dark room",
+    options=options_for,
+    run=reconstruct,
+    stages=("volume", "mesh", "surface"),
+    # 120 photos of 400 x 400 took 217 s and 2.4 GB at standard, half of it the volume pass; 56 s at
+    # draft
+    cost={"draft": (55.0, 0.9e9), "standard": (215.0, 2.0e9), "high": (600.0, 2.8e9)},
+    ablations={
+        "offset": "the flash's place beside the lens (PIR Sec. 3.3)",
+        "shadow": "soft visibility of the flash (PIR Eq. 5)",
+        "interreflection": "light that surfaces reflect onto each other (PIR Sec. 3.4)",
+        "features": "shared gloss of similar places (PIR Sec. 3.5)",
+        "refinement": "the normal map (PIR Sec. 3.6)",
+    },
+)

@@ -46,15 +46,13 @@ from relit.geometry.sdf import dense_values, row_features
 from relit.geometry.se3 import align_cameras, nearest_rotation
 from relit.materials.field import normal_map, pictures
 from relit.materials.intrinsic import base_without_shading
+from relit.recipe import Recipe
 from relit.rendering.appearance.fixed_light import mean_radiance
 from relit.rendering.background import start_background
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
 from relit.settings import check_levels, check_parts, preset
-
-LIGHT = "one fixed light is assumed (multiview)"  # what `relit inspect` says
-STAGES = ("volume", "mesh", "surface")
 
 
 @dataclass(frozen=True)
@@ -415,3 +413,24 @@ def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], poses=No
         (p.name, p.camera.with_pose(pose)) for p, pose in zip(capture.photos, poses, strict=True)
     )
     return Asset(placed, material, world_from_asset, maps["environment"], cameras, {})
+
+
+RECIPE = Recipe(
+    name="multiview",
+    light="one fixed light is assumed (multiview)",
+    options=options_for,
+    run=reconstruct,
+    stages=("volume", "mesh", "surface"),
+    cost={"draft": (50.0, 0.9e9), "standard": (250.0, 2.1e9), "high": (1000.0, 3.0e9)},
+    ablations={
+        "interreflection": "light that surfaces reflect onto each other",
+        "exchange": "steps along which light and base colour trade brightness",
+        "white": "the penalty of base colours brighter than white paint",
+        "material_prior": "smoothness and sparsity of roughness and metallic",
+        "colour_smoothing": "smoothness of base colour between similar neighbours",
+        "light_prior": "total variation and chroma of the environment",
+        "parsimony": "the prior of few distinct base colours",
+        "normal_map": "shading detail finer than the mesh",
+        "first_material": "the choice between metal and paint before the surface pass",
+    },
+)
