@@ -140,7 +140,7 @@ def told_flags(verb, kind) -> set[str]:
     text = (ROOT / "docs/flags.md").read_text(encoding="utf-8")
     sections = dict(part.split("\n", 1) for part in re.split(r"^##+ relit ", text, flags=re.M)[1:])
     found = sections[verb] + (
-        sections.get(f"{kind}: flags of its own" if " " in kind else kind, "") if kind else ""
+        sections.get(f"{kind}: own flags" if " " in kind else kind, "") if kind else ""
     )
     return {
         o

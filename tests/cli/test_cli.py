@@ -46,7 +46,7 @@ def test_help_is_quick():
     assert spent < 1.0  # of processor time, which other work leaves alone; 0.2 s usually
 
 
-def test_overview_lists_what_there_is(capsys):
+def test_overview_lists_every_verb(capsys):
     for argv in ((), ("--help",), ("-h",)):
         code, out, _ = run(capsys, *argv)
         assert code == 0
@@ -78,9 +78,9 @@ def test_every_verb_has_help_with_common_flags_first(capsys, verb):
             "--quality drft is not known. Did you mean 'draft'?",
         ),
         (["reconstruct", "x", "-o", "y", "--qual", "draft"], "unknown flag '--qual'"),
-        (["reconstruct", "x"], "missing: -o/--out"),
-        (["reconstruct", "-o", "y"], "missing: input"),
-        (["reconstruct", "x", "y", "-o", "z"], "unexpected 'y'"),
+        (["reconstruct", "x"], "missing argument: -o/--out"),
+        (["reconstruct", "-o", "y"], "missing argument: input"),
+        (["reconstruct", "x", "y", "-o", "z"], "unexpected argument 'y'"),
         (["reconstruct", "x", "-o", "y", "--sphere", "1,2,3"], "'1,2,3' is not X,Y,Z,RADIUS"),
         (["reconstruct", "x", "-o", "y", "--sphere", "0,0,0,-1"], "is not X,Y,Z,RADIUS"),
         (["reconstruct", "x", "-o", "y", "--seed", "many"], "invalid int value: 'many'"),
@@ -105,7 +105,7 @@ def test_every_verb_has_help_with_common_flags_first(capsys, verb):
             "Did you mean 'multiview'?",
         ),
         (["export", "x", "-o", "y.stl"], "cannot be told from the ending"),
-        (["evaluate", "x"], "missing: --truth"),
+        (["evaluate", "x"], "missing argument: --truth"),
         (
             ["relight", "x", "--light", "l.hdr", "-o", "y", "--albedo-scale", "1,2"],
             "'1,2' is not one number or R,G,B",
@@ -121,7 +121,17 @@ def test_wrong_usage_is_exit_code_2(capsys, tmp_path, monkeypatch, argv, said):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_flags_stand_in_any_order_and_values_may_be_negative(tmp_path):
+def test_short_flags():
+    words = "-q draft -d cpu -s texture=64 -s rays=9 -c a.toml -f photos -o run".split()
+    args = verbs.parser_for("reconstruct").parse(words)
+    assert (args.quality, args.device, args.pairs) == ("draft", "cpu", ["texture=64", "rays=9"])
+    assert (args.config, args.out, args.overwrite) == (Path("a.toml"), Path("run"), True)
+    assert verbs.parser_for("benchmark").parse(["multiview", "-q", "high"]).quality == "high"
+    with pytest.raises(UserError, match="--quality drft is not known. Did you mean 'draft'"):
+        verbs.parser_for("reconstruct").parse(["-q", "drft", "photos", "-o", "run"])
+
+
+def test_flags_in_any_order_and_negative_values(tmp_path):
     parser = verbs.parser_for("reconstruct")
     words = [
         "--quality",
@@ -172,7 +182,7 @@ def stub(monkeypatch, act):
     monkeypatch.setitem(verbs.VERBS, "doctor", verbs.Verb("stub", lambda parser: None, act))
 
 
-def test_a_user_error_is_said_in_full_with_its_code(capsys, monkeypatch):
+def test_user_error_is_printed_in_full_with_its_code(capsys, monkeypatch):
     def act(args):
         raise UserError(
             "3 photos of 60 are empty", "the camera ran out of power", "remove them: a.jpg", code=4
@@ -218,7 +228,7 @@ def test_an_unexpected_error_is_one_line_and_a_file(capsys, monkeypatch, tmp_pat
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_lacks_of_the_machine(capsys, monkeypatch, error, code, said):
+def test_errors_of_the_machine(capsys, monkeypatch, error, code, said):
     def act(args):
         raise error
 

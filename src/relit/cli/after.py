@@ -1,4 +1,4 @@
-"""export, relight, view: what is done with an asset."""
+"""Verbs that use an asset: export, relight, view."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import argparse
 from pathlib import Path
 
 from relit.asset.forms import SUFFIXES, form_of
-from relit.cli.parser import DEVICES, Parser, free, out_flag, path_in
+from relit.cli.parser import Parser, device_flag, free, out_flag, overwrite_flag, path_in
 from relit.errors import EXIT_USAGE, UserError
 
 
 def export_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
-    out_flag(parser, "file (or folder, for mitsuba) to write")
+    out_flag(parser, "output file (folder for mitsuba)")
     parser.common.add_argument(
-        "--format", choices=tuple(SUFFIXES), default=None, help="default: by the ending of -o"
+        "--format",
+        choices=tuple(SUFFIXES),
+        default=None,
+        help="format (default: from the suffix of -o)",
     )
-    parser.more.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    overwrite_flag(parser)
     parser.more.add_argument(
-        "--no-photos", action="store_true", help="html: leave the photos out, a smaller file"
+        "--no-photos", action="store_true", help="html: omit the photos for a smaller file"
     )
 
 
@@ -48,36 +51,36 @@ def scale(text: str) -> tuple[float, ...]:
 
 def relight_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
-    light = "lat-long .hdr or .exr, or spherical Gaussians in a .json"
+    light = "light: lat-long .hdr or .exr, or spherical Gaussians as .json"
     parser.common.add_argument("--light", required=True, type=Path, metavar="FILE", help=light)
-    out_flag(parser, "folder of pictures, or FILE.mp4")
+    out_flag(parser, "output folder of images, or FILE.mp4")
     add = parser.common.add_argument
     add(
         "--cameras",
         default="capture",
         metavar="WHICH",
-        help="capture (default), orbit:N for a turntable, or a transforms.json",
+        help="cameras: capture (default), orbit:N for a turntable, or a transforms.json",
     )
-    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    device_flag(parser)
     more = parser.more.add_argument
-    more("--spp", type=int, default=64, help="samples a pixel (default 64)")
-    more("--size", type=int, default=None, metavar="PIXELS", help="longer side of the pictures")
+    more("--spp", type=int, default=64, help="samples per pixel (default 64)")
+    more("--size", type=int, default=None, metavar="PIXELS", help="longer side of the images")
     more(
         "--rotate",
         type=float,
         default=0.0,
         metavar="DEGREES",
-        help="turn the light about the object's up",
+        help="rotate the light about the object's up axis",
     )
     more(
         "--albedo-scale",
         type=scale,
         default=None,
         metavar="S or R,G,B",
-        help="multiplies the base colour",
+        help="factor on the base colour",
     )
-    more("--exr", action="store_true", help="linear EXR pictures besides the PNG ones")
-    more("--overwrite", action="store_true", help="replace existing pictures")
+    more("--exr", action="store_true", help="also write linear EXR images")
+    overwrite_flag(parser)
 
 
 def do_relight(args) -> None:
@@ -96,16 +99,16 @@ def do_relight(args) -> None:
         "rotate": args.rotate,
     }
     options["albedo_scale"] = args.albedo_scale
-    with counted("relight, samples a pixel") as progress:
+    with counted("relight, samples per pixel") as progress:
         relight(args.run, args.light, args.out, progress=progress, **options)
     print(args.out)
 
 
 def view_flags(parser: Parser) -> None:
-    path_in(parser, "run", "run folder (one at work too) or asset folder")
+    path_in(parser, "run", "run folder (running or finished) or asset folder")
     add = parser.common.add_argument
-    add("--no-browser", action="store_true", help="print the address only")
-    add("--port", type=int, default=0, help="port on 127.0.0.1 (default: a free one)")
+    add("--no-browser", action="store_true", help="print the address; do not open a browser")
+    add("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
 
 
 def do_view(args) -> None:
@@ -113,7 +116,7 @@ def do_view(args) -> None:
 
     if not 0 <= args.port <= 65535:
         raise UserError(
-            f"--port {args.port} is no port", fix="choose 1024 to 65535", code=EXIT_USAGE
+            f"--port {args.port} is not a port", fix="choose 1024 to 65535", code=EXIT_USAGE
         )
     serve_until_stopped(
         run_server(args.run, args.port), lambda text: print(text, flush=True), not args.no_browser

@@ -1,11 +1,11 @@
-"""edit, insert: a recovered pile with another material, an instance less, a new object."""
+"""Verbs that change a scene: edit (material, instances), insert (a new object)."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from relit.cli.parser import DEVICES, Parser, free, out_flag, path_in
+from relit.cli.parser import Parser, device_flag, free, out_flag, overwrite_flag, path_in
 from relit.errors import EXIT_USAGE, UserError
 
 
@@ -31,43 +31,43 @@ def pixel(text: str) -> tuple[float, ...]:
 
 def edit_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
-    out_flag(parser, "asset folder to write; with --photo also photo.png in it")
+    out_flag(parser, "output asset folder; with --photo also photo.png in it")
     add, more = parser.common.add_argument, parser.more.add_argument
     add(
         "--photo",
         type=Path,
         default=None,
         metavar="FILE",
-        help="a photo of the run, known by its name or content: it is changed as well",
+        help="photo of the run to edit, matched by name or content",
     )
-    add("--tint", type=colour, default=None, metavar="R,G,B", help="multiplies the base colour")
+    add("--tint", type=colour, default=None, metavar="R,G,B", help="factor on the base colour")
     add(
         "--base-color",
         type=colour,
         default=None,
         metavar="R,G,B",
-        help="linear, in place of the texture",
+        help="constant base colour, linear",
     )
-    add("--roughness", type=float, default=None, help="a constant in place of the map")
-    add("--metallic", type=float, default=None, help="a constant in place of the map")
+    add("--roughness", type=float, default=None, help="constant roughness")
+    add("--metallic", type=float, default=None, help="constant metallic")
     add(
         "--remove",
         type=int,
         nargs="*",
         default=[],
         metavar="LABEL",
-        help="instances to take away; labels beside --photo say exactly where they are",
+        help="instances to remove; labels beside --photo give their exact outlines",
     )
-    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
-    more("--spp", type=int, default=64, help="samples a pixel (default 64)")
-    more("--overwrite", action="store_true", help="replace what is there")
+    device_flag(parser)
+    more("--spp", type=int, default=64, help="samples per pixel (default 64)")
+    overwrite_flag(parser)
 
 
 def do_edit(args) -> None:
     if args.base_color is not None and max(args.base_color) > 1:
         raise UserError(
             "--base-color has a value above 1",
-            "a surface reflects no more than it receives",
+            "a surface cannot reflect more light than it receives",
             code=EXIT_USAGE,
         )
     free(args.out, args.overwrite)
@@ -88,39 +88,39 @@ def do_edit(args) -> None:
 
 def insert_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder of a duplicates capture")
-    out_flag(parser, "picture to write")
+    out_flag(parser, "output image")
     add, more = parser.common.add_argument, parser.more.add_argument
     add(
         "--photo",
         type=Path,
         required=True,
         metavar="FILE",
-        help="a photo of the run, known by its name or content",
+        help="photo of the run, matched by name or content",
     )
     add(
         "--model",
         type=Path,
         required=True,
         metavar="FILE",
-        help=".glb, .gltf, .obj or an asset folder",
+        help="model to insert: .glb, .gltf, .obj or an asset folder",
     )
     add(
         "--at",
         type=pixel,
         required=True,
         metavar="X,Y",
-        help="pixel of the photo where it stands on the ground",
+        help="pixel of the photo where the model touches the ground",
     )
     add(
         "--size",
         type=float,
         default=1.0,
-        help="of its bounding sphere, in that of the recovered object (default 1)",
+        help="size of its bounding sphere, relative to the recovered object (default 1)",
     )
-    add("--turn", type=float, default=0.0, metavar="DEGREES", help="about the vertical")
-    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
-    more("--spp", type=int, default=128, help="samples a pixel (default 128)")
-    more("--overwrite", action="store_true", help="replace what is there")
+    add("--turn", type=float, default=0.0, metavar="DEGREES", help="rotation about the vertical")
+    device_flag(parser)
+    more("--spp", type=int, default=128, help="samples per pixel (default 128)")
+    overwrite_flag(parser)
 
 
 def do_insert(args) -> None:

@@ -1,5 +1,7 @@
-"""doctor, demo, inspect, reconstruct, quadrants: flags, and the function that each calls. Heavy
-imports stand inside the functions."""
+"""Verbs around a reconstruction: doctor, demo, inspect, reconstruct, quadrants.
+
+Heavy modules are imported inside the functions.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +9,17 @@ import json
 from pathlib import Path
 
 from relit.cli.parser import (
-    DEVICES,
     OPENING,
-    QUALITIES,
     Parser,
     capture_flag,
+    device_flag,
     free,
     job_flags,
     opening_flags,
     out_flag,
+    overwrite_flag,
     path_in,
+    quality_flag,
 )
 
 # ---------------------------------------------------------------- doctor, demo, inspect
@@ -35,15 +38,11 @@ def do_doctor(args) -> int:
 
 
 def demo_flags(parser: Parser) -> None:
-    out_flag(parser, "folder for the capture and the run (default runs/demo)", Path("runs/demo"))
-    parser.common.add_argument(
-        "--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one"
+    out_flag(
+        parser, "output folder for the capture and the run (default runs/demo)", Path("runs/demo")
     )
-    parser.common.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="begin anew where an earlier demo is complete or was stopped",
-    )
+    device_flag(parser)
+    overwrite_flag(parser, "replace an earlier demo")
 
 
 def do_demo(args) -> None:
@@ -56,36 +55,33 @@ def inspect_flags(parser: Parser) -> None:
     path_in(parser, "input", "folder of photos, transforms.json, COLMAP model, ...")
     parser.common.add_argument("--json", action="store_true", help="print JSON")
     capture_flag(parser)
-    parser.common.add_argument(
-        "--quality",
-        choices=QUALITIES,
-        default="standard",
-        help="for the estimate of time and memory",
-    )
+    quality_flag(parser, "standard", "quality for the estimate of time and memory")
     parser.common.add_argument(
         "--plot",
         type=Path,
         default=None,
         metavar="FILE.svg",
-        help="draw the cameras around the object sphere",
+        help="plot the cameras around the object sphere",
     )
     parser.common.add_argument(
         "--html",
         type=Path,
         default=None,
         metavar="FILE.html",
-        help="a page with all that was looked at",
+        help="write a page with images of all checks",
     )
     parser.more.add_argument(
         "--edit",
         action="store_true",
-        help="open a page where masks are painted and the object is boxed",
+        help="open a page to correct masks and the object sphere",
     )
     parser.more.add_argument(
-        "--port", type=int, default=0, help="of --edit, on 127.0.0.1 (default: a free one)"
+        "--port", type=int, default=0, help="port of --edit on 127.0.0.1 (default: any free port)"
     )
     parser.more.add_argument(
-        "--no-browser", action="store_true", help="of --edit: print the address only"
+        "--no-browser",
+        action="store_true",
+        help="with --edit: print the address; do not open a browser",
     )
     opening_flags(parser)
 
@@ -119,31 +115,29 @@ def reconstruct_flags(parser: Parser) -> None:
     path_in(
         parser, "input", "folder of photos, transforms.json, COLMAP model, ... (docs/formats.md)"
     )
-    out_flag(parser, "run folder; giving the same command again resumes")
+    out_flag(parser, "run folder; the same command again resumes")
     add = parser.common.add_argument
     capture_flag(parser)
     job_flags(parser, None)
     add(
+        "-s",
         "--set",
         action="append",
         default=[],
         metavar="KEY=VALUE",
         dest="pairs",
-        help="one setting of the recipe; may be repeated",
+        help="set one option of the recipe; may be repeated",
     )
     add(
+        "-c",
         "--config",
         type=Path,
         default=None,
         metavar="FILE.toml",
-        help="settings from a file, a run's config.toml too; flags win",
+        help="settings from a file or a run's config.toml; flags override it",
     )
     opening_flags(parser)
-    parser.more.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="remove what an earlier run left in the folder and begin anew",
-    )
+    overwrite_flag(parser, "delete an earlier run in the folder and start again")
 
 
 def do_reconstruct(args) -> None:
@@ -168,20 +162,20 @@ def do_reconstruct(args) -> None:
 
 
 def quadrants_flags(parser: Parser) -> None:
-    path_in(parser, "input", "folder of the photos of a collection")
+    path_in(parser, "input", "folder of photos of a collection")
     parser.common.add_argument(
-        "--terminal", action="store_true", help="ask in the terminal instead of a page"
+        "--terminal", action="store_true", help="use the terminal instead of a page"
     )
     parser.common.add_argument(
         "--guess",
         metavar="RUN",
-        help="fill in what the cameras of a finished run say; Enter takes it",
+        help="suggest answers from the cameras of a finished run; Enter accepts",
     )
     parser.more.add_argument(
-        "--port", type=int, default=0, help="of the page, on 127.0.0.1 (default: a free one)"
+        "--port", type=int, default=0, help="port of the page on 127.0.0.1 (default: any free port)"
     )
     parser.more.add_argument(
-        "--no-browser", action="store_true", help="print the page's address only"
+        "--no-browser", action="store_true", help="print the address; do not open a browser"
     )
 
 

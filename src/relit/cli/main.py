@@ -2,7 +2,7 @@
 
 Exit codes: 0 ok, 2 usage, 3 bad input, 4 reconstruction failed, 5 environment; 1 for an error of
 Relit itself, 130 after Ctrl-C, 143 after SIGTERM. Results go to stdout, everything else to stderr.
-Heavy modules are imported by the verb that needs them: `relit --help` answers at once.
+Heavy modules are imported by the verb that needs them: `relit --help` stays fast.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ EXIT_BUG, EXIT_INTERRUPTED, EXIT_TERMINATED = 1, 130, 143
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns its exit code and never raises for a user's mistake."""
+    """Run one command and return its exit code. A user's mistake is printed, never raised."""
     argv = list(sys.argv[1:] if argv is None else argv)
     from relit.run import stopped_by, termination
 
@@ -34,9 +34,8 @@ def main(argv: list[str] | None = None) -> int:
         with guard:
             return _dispatch(argv)
     except BrokenPipeError:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # the reader left; Python's own flush at exit must not fail
+        # the reader closed the pipe; Python's flush at exit must not fail
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_OK
     except BaseException as raised:
         return _answer(stopped_by(raised), argv)
@@ -49,14 +48,12 @@ def command() -> None:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
-        os._exit(
-            code
-        )  # Dr.Jit's threads may be at work, or half loaded: the interpreter's own end would abort
+        os._exit(code)  # Dr.Jit's threads may still run; a regular exit would abort
     sys.exit(code)
 
 
 def _answer(error: BaseException, argv: list[str]) -> int:
-    """Say what ended the command; returns its exit code."""
+    """Print what ended the command; returns its exit code."""
     from relit.run import Terminated
 
     if isinstance(error, UserError):
@@ -68,7 +65,7 @@ def _answer(error: BaseException, argv: list[str]) -> int:
         print("terminated", file=sys.stderr)
         return EXIT_TERMINATED
     if isinstance(error, MemoryError):
-        what = "the machine has run out of memory" + (f": {error}" if str(error) else "")
+        what = "out of memory" + (f": {error}" if str(error) else "")
         return _report(
             UserError(
                 what,
@@ -87,7 +84,7 @@ def _dispatch(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(_overview(VERBS))
         return EXIT_OK
-    if argv[0] == "--version":
+    if argv[0] in ("-V", "--version"):
         print(f"relit {__version__}")
         return EXIT_OK
     verb, rest = argv[0], argv[1:]
@@ -102,7 +99,7 @@ def _dispatch(argv: list[str]) -> int:
             code=EXIT_USAGE,
         )
     args = parser_for(verb, rest).parse(rest)
-    if args is None:  # --help was answered
+    if args is None:  # --help was printed
         return EXIT_OK
     return VERBS[verb].act(args) or EXIT_OK
 
@@ -112,13 +109,13 @@ def _overview(verbs: dict) -> str:
     lines = [
         "usage: relit VERB INPUT [flags]",
         "",
-        "Photographs of an object into a 3D asset that can be relit.",
+        "Reconstruct a relightable 3D asset from photographs of an object.",
         "",
     ]
     lines += [f"  {name.ljust(width)}  {verb.summary}" for name, verb in verbs.items()]
     lines += [
         "",
-        "relit VERB --help shows the flags of one verb. First steps: relit doctor, then relit demo.",
+        "relit VERB --help lists the flags of one verb. First steps: relit doctor, then relit demo.",
     ]
     return "\n".join(lines)
 
@@ -131,7 +128,7 @@ def _report(error: UserError) -> int:
 
 
 def _unexpected(error: Exception, argv: list[str]) -> int:
-    """An error of Relit itself: one line for the reader, the traceback into a file."""
+    """A bug of Relit: print one line, write the traceback to a file."""
     if isinstance(error, OSError):
         from relit.files import disk_error
 
@@ -146,14 +143,14 @@ def _unexpected(error: Exception, argv: list[str]) -> int:
         f"relit {__version__}: relit {' '.join(argv)}\n{''.join(traceback.format_exception(error))}"
     )
     where = _keep(text, argv)
-    said = f"error: {type(error).__name__}: {error}\nwhy: this is a fault of Relit, not of your input\nfix: report it with {where}"
+    said = f"error: {type(error).__name__}: {error}\nwhy: this is a bug in Relit, not in your input\nfix: report it with {where}"
     print(said, file=sys.stderr)
     return EXIT_BUG
 
 
 def _keep(text: str, argv: list[str]) -> str:
-    """Write the traceback to log.txt of the run folder when there is one, else to a temporary file;
-    returns where."""
+    """Append the traceback to log.txt of the run folder, or write a temporary file. Returns its
+    path."""
     for flag, value in itertools.pairwise(argv):
         log = Path(value) / "log.txt"
         if flag in ("-o", "--out") and log.is_file():
@@ -170,7 +167,7 @@ def _keep(text: str, argv: list[str]) -> str:
             file.write(text)
         return file.name
     except OSError:
-        return "RELIT_DEBUG=1, which prints where it happened"
+        return "the traceback that RELIT_DEBUG=1 prints"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""evaluate, benchmark: figures of a result against what is known."""
+"""Verbs that measure: evaluate, benchmark."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ import json
 import sys
 from pathlib import Path
 
-from relit.cli.parser import DEVICES, Parser, job_flags, path_in
+from relit.cli.parser import Parser, device_flag, job_flags, path_in
 
 
 def evaluate_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
-    truth = "what relit synthesize wrote, or the capture itself: its held-out photos"
+    truth = "folder of relit synthesize, or the capture itself (uses its held-out photos)"
     parser.common.add_argument("--truth", required=True, type=Path, metavar="DIR", help=truth)
     parser.common.add_argument(
         "--json", type=Path, default=None, metavar="FILE", help="write the figures there"
     )
-    parser.common.add_argument(
-        "--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one"
-    )
+    device_flag(parser)
     parser.more.add_argument(
         "--spp",
         type=int,
         default=None,
-        help="samples a pixel of the compared pictures (default 256; of piles of duplicates 64)",
+        help="samples per pixel of the compared images (default 256; 64 for duplicates)",
     )
 
 

@@ -1,5 +1,4 @@
-"""The parser of one verb: argparse whose complaints are answers, and the flags that several verbs
-share."""
+"""The parser of one verb: argparse with UserError messages, and the flags that several verbs share."""
 
 from __future__ import annotations
 
@@ -18,8 +17,8 @@ KINDS = ("multiview", "flash", "duplicates", "collection")
 
 @dataclass(frozen=True)
 class Kind:
-    """What a verb does for one kind of capture. flags: adds the kind's own flags to the verb's
-    parser. act: does it."""
+    """One kind of capture of a verb. flags: adds the kind's own flags to the verb's parser. act:
+    runs the verb for this kind."""
 
     flags: Callable[[Parser], None]
     act: Callable[[argparse.Namespace], int | None]
@@ -27,9 +26,8 @@ class Kind:
 
 @dataclass(frozen=True)
 class Verb:
-    """summary: one line for the overview. flags: adds arguments to a parser (common ones to the
-    first group). act: does it.
-    kinds: for a verb whose first positional names a kind of capture, what each kind adds."""
+    """One verb. summary: one line for the overview. flags: adds arguments to a parser. act: runs
+    the verb. kinds: for a verb whose first positional is a kind of capture, one entry per kind."""
 
     summary: str
     flags: Callable[[Parser], None]
@@ -37,8 +35,8 @@ class Verb:
     kinds: Mapping[str, Kind] = field(default_factory=dict)
 
     def kind_in(self, argv: Sequence[str]) -> str:
-        """The kind that the words after the verb name: the first of them that is one and does not
-        follow a flag; else the first kind."""
+        """The kind named in argv: the first word that is a kind and does not follow a flag; otherwise
+        the first kind."""
         for before, word in zip(("", *argv), argv, strict=False):
             if word in self.kinds and (not before.startswith("-") or "=" in before):
                 return word
@@ -46,17 +44,21 @@ class Verb:
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse whose complaints are UserErrors with a suggestion; `common` and `more` are the two
-    groups of the help."""
+    """argparse that raises UserError with a suggestion. `common` and `more` are the two groups of
+    the help."""
 
     def __init__(self, verb: str, summary: str):
-        super().__init__(prog=f"relit {verb}", description=summary, allow_abbrev=False)
+        super().__init__(
+            prog=f"relit {verb}",
+            description=f"{summary[0].upper()}{summary[1:]}.",
+            allow_abbrev=False,
+        )
         self.verb = verb
         self.common = self.add_argument_group("common flags")
         self.more = self.add_argument_group("more flags")
 
     def parse(self, argv: list[str]) -> argparse.Namespace | None:
-        """Parsed arguments, or None when --help was asked and answered."""
+        """Parsed arguments, or None after --help has been printed."""
         if "-h" in argv or "--help" in argv:
             self.print_help()
             return None
@@ -89,7 +91,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str):
         missing = re.match(r"the following arguments are required: (.*)", message)
-        what = f"missing: {missing.group(1)}" if missing else message
+        what = f"missing argument: {missing.group(1)}" if missing else message
         raise UserError(
             f"relit {self.verb}: {what}", fix=f"relit {self.verb} --help", code=EXIT_USAGE
         )
@@ -106,7 +108,7 @@ class Parser(argparse.ArgumentParser):
         if word.startswith("-"):
             what = f"relit {self.verb}: unknown flag '{flag}'.{did_you_mean(flag, flags)}"
         else:
-            what = f"relit {self.verb}: unexpected '{word}'; there is one input"
+            what = f"relit {self.verb}: unexpected argument '{word}'"
         raise UserError(what, fix=f"relit {self.verb} --help", code=EXIT_USAGE)
 
 
@@ -126,21 +128,25 @@ def out_flag(parser: Parser, text: str, default: Path | None = None) -> None:
     )
 
 
+def device_flag(parser: Parser) -> None:
+    text = "compute device; auto uses the GPU if there is one (default)"
+    parser.common.add_argument("-d", "--device", choices=DEVICES, default="auto", help=text)
+
+
+def overwrite_flag(parser: Parser, text: str = "replace existing output") -> None:
+    parser.more.add_argument("-f", "--overwrite", action="store_true", help=text)
+
+
+def quality_flag(parser: Parser, default: str | None, text: str) -> None:
+    parser.common.add_argument("-q", "--quality", choices=QUALITIES, default=default, help=text)
+
+
 def job_flags(parser: Parser, quality: str | None) -> None:
-    add = parser.common.add_argument
-    add(
-        "--quality",
-        choices=QUALITIES,
-        default=quality,
-        help="draft (about a minute), standard (default) or high",
-    )
-    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
-    add(
-        "--seed",
-        type=int,
-        default=None,
-        help="same seed, same result within tolerance on the CPU (default 0)",
-    )
+    """Quality, device and seed of a reconstruction."""
+    quality_flag(parser, quality, "draft (about a minute), standard (default) or high")
+    device_flag(parser)
+    text = "random seed; on the CPU results repeat within tolerance (default 0)"
+    parser.common.add_argument("--seed", type=int, default=None, help=text)
 
 
 def capture_flag(parser: Parser) -> None:
@@ -148,20 +154,15 @@ def capture_flag(parser: Parser) -> None:
         "--capture",
         choices=("auto", *KINDS),
         default=None,
-        help="what kind of photos (default auto)",
+        help="kind of photos (default auto)",
     )
 
 
-OPENING = (
-    "masks",
-    "sphere",
-    "max_side",
-    "focal",
-)  # what `opening_flags` give, fields of `relit.job.Job`
+OPENING = ("masks", "sphere", "max_side", "focal")  # `opening_flags`; fields of `relit.job.Job`
 
 
 def opening_flags(parser: Parser) -> None:
-    """Flags that say how the input is to be read."""
+    """Flags that control how the input is read."""
     add = parser.more.add_argument
     add(
         "--masks",
@@ -174,21 +175,21 @@ def opening_flags(parser: Parser) -> None:
         type=sphere,
         default=None,
         metavar="X,Y,Z,R",
-        help="ball that holds the object, in the frame and unit of the cameras",
+        help="sphere that contains the object, in the frame and unit of the cameras",
     )
     add(
         "--max-side",
         type=int,
         default=None,
         metavar="PIXELS",
-        help="shrink photos whose longer side is longer",
+        help="downscale photos to at most this longer side",
     )
     add(
         "--focal",
         type=float,
         default=None,
         metavar="PIXELS",
-        help="known focal length, for photos without cameras",
+        help="focal length of photos without cameras",
     )
 
 
@@ -204,11 +205,11 @@ def sphere(text: str) -> tuple[float, ...]:
 
 
 def free(path: Path, overwrite: bool) -> None:
-    """Nothing is overwritten silently: refuse an existing file or a folder with something in it."""
+    """Refuse an existing file or a non-empty folder, so that nothing is overwritten silently."""
     taken = path.is_file() or (path.is_dir() and any(path.iterdir()))
     if taken and not overwrite:
         raise UserError(
-            "the output is there already; nothing was overwritten",
+            "the output already exists; nothing was overwritten",
             fix=f"give another -o, or --overwrite: {path}",
         )
     path.parent.mkdir(parents=True, exist_ok=True)

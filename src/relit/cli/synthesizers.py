@@ -1,5 +1,4 @@
-"""synthesize: one entry of SYNTHESIZERS for each kind of capture that can be rendered, with its own
-flags.
+"""The verb synthesize: one entry of SYNTHESIZERS for each kind of capture, with its own flags.
 
 A new kind adds a flags function, an act and its entry here.
 """
@@ -8,25 +7,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from relit.cli.parser import DEVICES, KINDS, Kind, Parser, out_flag
+from relit.cli.parser import KINDS, Kind, Parser, device_flag, out_flag
 from relit.errors import EXIT_USAGE, UserError
 
 
 def synthesize_flags(parser: Parser) -> None:
-    """What every kind takes."""
+    """Flags of every kind."""
     parser.add_argument(
         "kind",
         choices=KINDS,
-        help="kind of capture; each has flags of its own: relit synthesize KIND --help",
+        help="kind of capture; see its own --help",
     )
     add = parser.common.add_argument
-    add("--asset", required=True, type=Path, metavar="FILE", help=".glb, .gltf or .obj")
-    out_flag(parser, "folder to write")
-    add("--device", choices=DEVICES, default="auto", help="auto takes the GPU when there is one")
+    add("--asset", required=True, type=Path, metavar="FILE", help="model: .glb, .gltf or .obj")
+    out_flag(parser, "output folder")
+    device_flag(parser)
     more = parser.more.add_argument
-    more("--seed", type=int, default=0, help="default 0")
-    more("--roughness", type=float, default=None, help="constant instead of the file's map")
-    more("--metallic", type=float, default=None, help="constant instead of the file's map")
+    more("--seed", type=int, default=0, help="random seed (default 0)")
+    more("--roughness", type=float, default=None, help="constant in place of the file's texture")
+    more("--metallic", type=float, default=None, help="constant in place of the file's texture")
 
 
 def do_synthesize(args) -> None:
@@ -37,17 +36,21 @@ def do_synthesize(args) -> None:
 def sampling_flags(
     parser: Parser, *, views: int, test_views: int, resolution: int, spp: int, test_spp: int
 ) -> None:
-    """How many pictures of what size; the arguments are the defaults."""
+    """Number, size and samples of the images; the arguments are the defaults."""
     add, more = parser.common.add_argument, parser.more.add_argument
     add("--views", type=int, default=views, help=f"training photos (default {views})")
     add("--test-views", type=int, default=test_views, help=f"test photos (default {test_views})")
-    more("--resolution", type=int, default=resolution, help=f"pixels a side (default {resolution})")
-    more("--spp", type=int, default=spp, help=f"samples a pixel of training photos (default {spp})")
+    more(
+        "--resolution", type=int, default=resolution, help=f"pixels per side (default {resolution})"
+    )
+    more(
+        "--spp", type=int, default=spp, help=f"samples per pixel of training photos (default {spp})"
+    )
     more(
         "--test-spp",
         type=int,
         default=test_spp,
-        help=f"samples a pixel of what is measured against (default {test_spp})",
+        help=f"samples per pixel of test images (default {test_spp})",
     )
 
 
@@ -57,7 +60,12 @@ def sampling_flags(
 def multiview_flags(parser: Parser) -> None:
     add = parser.common.add_argument
     add(
-        "--light", required=True, type=Path, nargs="+", metavar="FILE", help="lat-long .hdr or .exr"
+        "--light",
+        required=True,
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="light: lat-long .hdr or .exr",
     )
     add(
         "--relight",
@@ -65,7 +73,7 @@ def multiview_flags(parser: Parser) -> None:
         nargs="*",
         default=[],
         metavar="FILE",
-        help="other lights, for the truth of relighting",
+        help="lights of the relighting ground truth",
     )
     sampling_flags(parser, views=60, test_views=12, resolution=400, spp=64, test_spp=256)
 
@@ -74,7 +82,7 @@ def multiview(args) -> None:
     if len(args.light) != 1:
         raise UserError(
             "a multiview capture has one light",
-            fix="give one file to --light; others go to --relight",
+            fix="give one file to --light, other lights to --relight",
             code=EXIT_USAGE,
         )
     from relit.device import use_device
@@ -110,7 +118,7 @@ def flash_flags(parser: Parser) -> None:
         nargs="*",
         default=[],
         metavar="NAME",
-        help="only these nodes of a .glb (default: all)",
+        help="nodes of a .glb to use (default: all)",
     )
     more(
         "--flash-offset",
@@ -118,15 +126,15 @@ def flash_flags(parser: Parser) -> None:
         nargs=3,
         default=None,
         metavar=("X", "Y", "Z"),
-        help="of the flash, right, down, forward (default -.11 -.06 0)",
+        help="offset of the flash: right, down, forward (default -.11 -.06 0)",
     )
-    more("--png", action="store_true", help="photos as 8-bit PNG instead of linear EXR")
+    more("--png", action="store_true", help="write photos as 8-bit PNG instead of linear EXR")
 
 
 def flash(args) -> None:
     if args.roughness is not None or args.metallic is not None:
         raise UserError(
-            "a flash capture's roughness is made with the object",
+            "the roughness of a flash capture is generated with the object",
             fix="leave out --roughness and --metallic",
             code=EXIT_USAGE,
         )
@@ -163,7 +171,7 @@ def collection_flags(parser: Parser) -> None:
         type=Path,
         nargs="+",
         metavar="FILE",
-        help="lat-long .hdr or .exr; each photo takes one",
+        help="lights: lat-long .hdr or .exr; each photo uses one",
     )
     sampling_flags(parser, views=60, test_views=6, resolution=400, spp=48, test_spp=192)
     more = parser.more.add_argument
@@ -172,7 +180,7 @@ def collection_flags(parser: Parser) -> None:
         type=float,
         default=1.0,
         metavar="PIXELS",
-        help="outlines of masks wander so far (default 1)",
+        help="amplitude of the error of mask outlines (default 1)",
     )
 
 
@@ -205,7 +213,12 @@ def collection(args) -> None:
 def duplicates_flags(parser: Parser) -> None:
     add, more = parser.common.add_argument, parser.more.add_argument
     add(
-        "--light", required=True, type=Path, nargs="+", metavar="FILE", help="lat-long .hdr or .exr"
+        "--light",
+        required=True,
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="light: lat-long .hdr or .exr",
     )
     add(
         "--relight",
@@ -213,24 +226,24 @@ def duplicates_flags(parser: Parser) -> None:
         nargs="*",
         default=[],
         metavar="FILE",
-        help="other lights, for the truth of relighting",
+        help="lights of the relighting ground truth",
     )
     add("--count", type=int, default=10, help="objects in the photo (default 10)")
     add("--photos", type=int, default=1, help="photos of the pile (default 1)")
     add("--test-views", type=int, default=8, help="novel views of the pile (default 8)")
-    more("--resolution", type=int, default=1600, help="pixels a side of the photo (default 1600)")
+    more("--resolution", type=int, default=1600, help="pixels per side of the photo (default 1600)")
     more(
         "--test-resolution",
         type=int,
         default=400,
-        help="pixels a side of the novel views (default 400)",
+        help="pixels per side of the novel views (default 400)",
     )
-    more("--spp", type=int, default=64, help="samples a pixel of the photo (default 64)")
+    more("--spp", type=int, default=64, help="samples per pixel of the photo (default 64)")
     more(
         "--test-spp",
         type=int,
         default=128,
-        help="samples a pixel of what is measured against (default 128)",
+        help="samples per pixel of test images (default 128)",
     )
     more(
         "--lean",
@@ -245,15 +258,15 @@ def duplicates_flags(parser: Parser) -> None:
         nargs="*",
         default=[],
         metavar="NAME",
-        help="only these nodes of a .glb (default: all)",
+        help="nodes of a .glb to use (default: all)",
     )
 
 
 def duplicates(args) -> None:
     if len(args.light) != 1:
         raise UserError(
-            "a photo has one light",
-            fix="give one file to --light; others go to --relight",
+            "a photo of duplicates has one light",
+            fix="give one file to --light, other lights to --relight",
             code=EXIT_USAGE,
         )
     from relit.device import use_device

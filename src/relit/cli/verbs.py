@@ -1,4 +1,4 @@
-"""The verbs of the command line: one entry each, with its flags and the function that it calls."""
+"""The table of verbs: for each its summary, its flags and the function that runs it."""
 
 from __future__ import annotations
 
@@ -24,53 +24,57 @@ from relit.cli.synthesizers import SYNTHESIZERS, do_synthesize, synthesize_flags
 
 VERBS: dict[str, Verb] = {
     "doctor": Verb(
-        "what this machine has, what is missing, and the command that mends it",
+        "check this machine; print the command that installs what is missing",
         doctor_flags,
         do_doctor,
     ),
     "demo": Verb(
-        "renders its own object, reconstructs it, scores it, writes the report", demo_flags, do_demo
+        "render a built-in object, reconstruct it, evaluate it, write the report",
+        demo_flags,
+        do_demo,
     ),
     "inspect": Verb(
-        "what an input is recognised as, and what a reconstruction would take",
+        "check photos, cameras, masks and light before a reconstruction",
         inspect_flags,
         do_inspect,
     ),
     "quadrants": Verb(
-        "asks where each photo of a collection was taken from", quadrants_flags, do_quadrants
+        "enter rough viewpoints of the photos of a collection", quadrants_flags, do_quadrants
     ),
     "reconstruct": Verb(
-        "photos into a relightable asset; giving the same command again resumes",
+        "reconstruct an asset from photos; the same command again resumes",
         reconstruct_flags,
         do_reconstruct,
     ),
     "export": Verb(
-        "the asset as glb, obj, ply, a Mitsuba scene or a page to send; its light as Gaussians",
+        "write an asset as glb, obj, ply, Mitsuba scene, HTML page, or its light as Gaussians",
         export_flags,
         do_export,
     ),
-    "relight": Verb("pictures of the asset under another light", relight_flags, do_relight),
+    "relight": Verb("render an asset under another light", relight_flags, do_relight),
     "edit": Verb(
-        "the asset with another material or an instance less, and the photo so changed",
+        "change the material or remove instances; optionally edit the photo to match",
         edit_flags,
         do_edit,
     ),
     "insert": Verb(
-        "a model put into the photo of a duplicates run, under the recovered light",
+        "insert a model into the photo of a duplicates run, under the recovered light",
         insert_flags,
         do_insert,
     ),
     "view": Verb(
-        "the page: object, light, photos against renders, a run at work", view_flags, do_view
+        "open the viewer: object, light, photos next to renders, progress of a run",
+        view_flags,
+        do_view,
     ),
     "evaluate": Verb(
-        "every figure that a known truth allows, with its definition", evaluate_flags, do_evaluate
+        "compare a result with ground truth or held-out photos", evaluate_flags, do_evaluate
     ),
     "synthesize": Verb(
-        "renders a capture with known truth", synthesize_flags, do_synthesize, SYNTHESIZERS
+        "render a capture with ground truth", synthesize_flags, do_synthesize, SYNTHESIZERS
     ),
     "benchmark": Verb(
-        "synthesize, reconstruct and evaluate over a suite", benchmark_flags, do_benchmark
+        "synthesize, reconstruct and evaluate all objects of a suite", benchmark_flags, do_benchmark
     ),
 }
 
@@ -78,8 +82,8 @@ __all__ = ["VERBS", "Parser", "Verb", "parser_for"]
 
 
 def parser_for(verb: str, argv: Sequence[str] = ()) -> Parser:
-    """The parser of one verb. argv: the words after the verb; a verb with kinds takes the flags of
-    the kind that they name."""
+    """The parser of one verb. argv: the words after the verb, which select the kind of a verb with
+    kinds."""
     spec = VERBS[verb]
     parser = Parser(verb, spec.summary)
     spec.flags(parser)
