@@ -221,7 +221,7 @@ def test_photos_of_mixed_sizes_are_named_or_read(capsys, capture):
     (["--masks", "magic"], 2, "magic"),
     (["--masks", "files"], 3, "mask"),
     (["--set", "no_such_key=1"], 2, "unknown key 'no_such_key'"),
-    (["--set", "nonsense"], 2, "no '='"),
+    (["--set", "nonsense"], 2, "'=' is missing"),
     (["--device", "cdua"], 2, "Did you mean 'cuda'?"),
 ])  # fmt: skip
 def test_flags_that_do_not_fit_the_input(capsys, tmp_path, capture, flags, code, said):
@@ -253,7 +253,7 @@ def test_config_file_with_an_unknown_key(capsys, tmp_path, capture):
         answered(got, err, 2, said)
     config.write_text("seed = 'many'\n")
     got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run", "--config", config)
-    answered(got, err, 2, "seed=many is no whole number")
+    answered(got, err, 2, "seed=many is not valid; expected whole number")
 
 
 def test_output_that_would_be_mixed_or_overwritten(capsys, tmp_path, capture):

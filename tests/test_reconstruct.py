@@ -112,7 +112,7 @@ def test_a_signal_inside_a_native_loop_is_still_a_stop(
     monkeypatch.setattr(multiview, "RECIPE", replace(multiview.RECIPE, run=fit))
     before = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
     got, _, err = relit(capsys, "reconstruct", capture, "-o", tmp_path / "run")
-    assert got == code and "goes on from the checkpoint" in err and "fault of Relit" not in err
+    assert got == code and "goes on from the checkpoint" in err and "bug in Relit" not in err
     assert before == [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
     assert (
         relit(capsys, "inspect", tmp_path / "nowhere")[0] == 3
@@ -391,4 +391,4 @@ def test_inspect_draws_the_cameras(capsys, tmp_path, capture):
     assert code == 3 and "nothing was overwritten" in err
     (capture / "transforms.json").unlink()
     code, _, err = relit(capsys, "inspect", capture, "--plot", tmp_path / "other.svg")
-    assert code == 3 and "not known yet" in err and not (tmp_path / "other.svg").exists()
+    assert code == 3 and "cameras are unknown" in err and not (tmp_path / "other.svg").exists()

@@ -1,11 +1,11 @@
-"""Relit: photographs of an object into a 3D asset that can be relit."""
+"""Relit: relightable 3D assets from photographs of an object."""
 
 import contextlib
 import ctypes
 
-# pycolmap's wheel (4.2.1) exports a zlib of its own and pulls in the system's libz.so.1, which then
-# binds to that one: the next PNG or zlib.compress corrupts the heap. A libz that is loaded before
-# pycolmap binds to itself.
+# pycolmap's wheel (4.2.1) exports its own zlib symbols, and the system's libz.so.1, loaded later,
+# binds to them: the next PNG or zlib.compress corrupts the heap. A libz loaded before pycolmap binds
+# to itself.
 with contextlib.suppress(OSError):
     ctypes.CDLL("libz.so.1")
 
@@ -14,8 +14,8 @@ __all__ = ["AssetFolder", "__version__", "inspect", "load", "open_capture", "rec
 
 
 def __getattr__(name: str):
-    """The functions of `relit.api`, imported when they are asked for: `import relit` and `relit
-    --help` stay quick."""
+    """Functions of `relit.api`, imported on first use: `import relit` and `relit --help` stay
+    fast."""
     import importlib
 
     if name == "open_capture":

@@ -128,6 +128,6 @@ def inspect(input: str | Path, **job) -> dict:
     """What an input was recognised as and what is odd about it (`relit inspect --json`). job:
     quality, masks, sphere, max_side, capture."""
     from relit.job import Job
-    from relit.preflight.inspect import inspect as preflight
+    from relit.preflight.inspect import inspect_input
 
-    return preflight(input, Job(**job))
+    return inspect_input(input, Job(**job))

@@ -1,5 +1,4 @@
-"""`relit demo`: the whole way on an object made of formulas. Nothing is downloaded; the truth is
-known, so the result is scored."""
+"""`relit demo`: render a procedural object, reconstruct it, evaluate it. Nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ from relit.files import write_text
 from relit.log import Log
 
 VIEWS, TEST_VIEWS, RESOLUTION = 36, 4, 256
-SPP, TEST_SPP = 32, 64  # samples a pixel of the photos, and of what is measured against
+SPP, TEST_SPP = 32, 64  # samples per pixel of the photos, and of the test images
 SHOWN = (
     "novel_psnr",
     "relit_psnr",
@@ -26,12 +25,11 @@ SHOWN = (
 def demo(
     out: str | Path, *, device: str = "auto", quality: str = "draft", overwrite: bool = False
 ) -> Path:
-    """Render the pawn of `synthesize.procedural`, reconstruct it, score it and write the report;
-    returns the run folder.
+    """Render the pawn of `synthesize.procedural`, reconstruct it, evaluate it and write the report.
+    Returns the run folder.
 
     `out` gets: truth.glb, light.exr, other_light.exr, capture/ (photos and truth), run/ (asset,
-    report.html, evaluation.json). The same call again takes up what was stopped. overwrite:
-    reconstruct anew.
+    report.html, evaluation.json). The same call again resumes. overwrite: start again.
     """
     from relit.asset.gltf import write_glb
     from relit.device import use_device
@@ -70,10 +68,10 @@ def demo(
     reconstruct(
         out / "capture", run, device=device, quality=quality, overwrite=overwrite, report=False
     )
-    log.say("3 of 4  scoring against the truth")
+    log.say("3 of 4  evaluating against the ground truth")
     result = evaluate(run, out / "capture", spp=TEST_SPP)
     write_text(run / "evaluation.json", json.dumps(result, indent=1) + "\n")
-    log.say("4 of 4  report")
+    log.say("4 of 4  writing the report")
     write_report(run, open_input(out / "capture", Job()))
     for name in SHOWN:
         if name in result["metrics"]:

@@ -1,4 +1,4 @@
-"""What this machine has, what Relit misses on it, and the one command that mends each lack."""
+"""Checks of this machine, and for each missing part the command that installs it."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ print("gradient", dr.grad(x)[0], difference[0])
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the report. ok: False is a lack that stops Relit, None one that does not. fix:
-    the one command, or ''."""
+    """One line of the report. ok: False for a missing part that Relit needs, None for an optional
+    one. fix: the command that installs it, or ''."""
 
     name: str
     ok: bool | None
@@ -63,7 +63,7 @@ class Check:
 
 
 def examine(folder: Path = Path(".")) -> list[Check]:
-    """Look at everything; `folder` is where runs will be written (its disk counts)."""
+    """Run all checks. folder: where runs will be written; its disk is checked."""
     llvm, cuda = _llvm(), _cuda()
     wheels = _wheels()
     checks = [_python(), wheels, llvm, *cuda]
@@ -76,7 +76,7 @@ def examine(folder: Path = Path(".")) -> list[Check]:
     return checks
 
 
-def verdict(checks: list[Check]) -> int:
+def doctor_exit_code(checks: list[Check]) -> int:
     """Exit code: 0 if a reconstruction can run on the CPU or the GPU, else 5."""
     by_name = {c.name: c for c in checks}
     works = any(by_name[n].ok for n in ("gradient on cpu", "gradient on cuda") if n in by_name)
@@ -88,30 +88,30 @@ def verdict(checks: list[Check]) -> int:
     return EXIT_OK if works and needed else EXIT_ENVIRONMENT
 
 
-def as_text(checks: list[Check]) -> str:
-    """The report for a reader: found things first, then what is missing and how to mend it."""
+def doctor_text(checks: list[Check]) -> str:
+    """The report as text: all checks, then the commands that install what is missing."""
     marks = {True: "ok      ", False: "MISSING ", None: "-       "}
     width = max(len(c.name) for c in checks)
     lines = [f"{marks[c.ok]}{c.name.ljust(width)}  {c.found}" for c in checks]
-    mends = [f"  {c.name}: {c.fix}" for c in checks if c.ok is False and c.fix]
+    fixes = [f"  {c.name}: {c.fix}" for c in checks if c.ok is False and c.fix]
     optional = [f"  {c.name}: {c.fix}" for c in checks if c.ok is None and c.fix]
-    if mends:
-        lines += ["", "to mend:", *mends]
+    if fixes:
+        lines += ["", "to fix:", *fixes]
     if optional:
         lines += ["", "optional:", *optional]
     lines += [
         "",
         "Relit can run on this machine."
-        if verdict(checks) == EXIT_OK
+        if doctor_exit_code(checks) == EXIT_OK
         else "Relit cannot run on this machine yet.",
     ]
     return "\n".join(lines)
 
 
-def as_json(checks: list[Check]) -> str:
+def doctor_json(checks: list[Check]) -> str:
     """{"ok": bool, "checks": [{name, ok, found, fix}]}"""
     return json.dumps(
-        {"ok": verdict(checks) == EXIT_OK, "checks": [asdict(c) for c in checks]}, indent=2
+        {"ok": doctor_exit_code(checks) == EXIT_OK, "checks": [asdict(c) for c in checks]}, indent=2
     )
 
 
@@ -164,13 +164,11 @@ def _llvm() -> Check:
         return Check(
             "libLLVM",
             False,
-            f"DRJIT_LIBLLVM_PATH names a file that is not there: {given}",
+            f"DRJIT_LIBLLVM_PATH names a file that does not exist: {given}",
             "unset DRJIT_LIBLLVM_PATH",
         )
     old = sorted({p for pattern in LLVM_PATTERNS for p in glob.glob(pattern)})
-    found = (
-        f"only older ones than {MIN_LLVM}: {', '.join(old)}" if old else "none in the usual places"
-    )
+    found = f"only versions below {MIN_LLVM}: {', '.join(old)}" if old else "not found"
     return Check("libLLVM", False, found, LLVM_FIX)
 
 
@@ -184,7 +182,7 @@ def _cuda() -> list[Check]:
             Check(
                 "CUDA",
                 None,
-                "nvidia-smi is there but answers nothing; the CPU is used",
+                "nvidia-smi prints nothing; the CPU is used",
                 "nvidia-smi",
             )
         ]
@@ -194,7 +192,7 @@ def _cuda() -> list[Check]:
             Check(
                 "CUDA",
                 None,
-                f"{found}, without OptiX (libnvoptix.so.1), which traces rays; the CPU is used",
+                f"{found}, without OptiX (libnvoptix.so.1), needed for ray tracing; the CPU is used",
                 OPTIX_FIX,
             )
         ]
@@ -211,7 +209,7 @@ def _gradient(device: str) -> Check:
             timeout=PROBE_SECONDS,
         )
     except subprocess.TimeoutExpired:
-        return Check(name, False, f"no answer in {PROBE_SECONDS} s")
+        return Check(name, False, f"no result after {PROBE_SECONDS} s")
     fix = LLVM_FIX if device == "cpu" else "update the NVIDIA driver, or use --device cpu"
     last = next((line for line in done.stdout.splitlines() if line.startswith("gradient ")), "")
     if done.returncode or not last:
@@ -221,19 +219,19 @@ def _gradient(device: str) -> Check:
             if done.returncode < 0
             else f"exit code {done.returncode}"
         )
-        return Check(name, False, f"the probe died ({how}): {said}", fix)
+        return Check(name, False, f"the test process ended ({how}): {said}", fix)
     gradient, difference = (float(x) for x in last.split()[1:])
     off = abs(gradient - difference) / max(abs(difference), 1e-9)
-    found = f"{gradient:.5f} against the finite difference {difference:.5f} ({100 * off:.2f} % off)"
+    found = f"{gradient:.5f}, finite difference {difference:.5f} ({100 * off:.2f} % error)"
     return Check(name, off < 0.02, found, "" if off < 0.02 else fix)
 
 
 def _memory() -> Check:
     free = available_memory()
     if free is None:
-        return Check("memory", None, "the system does not tell")
+        return Check("memory", None, "unknown on this system")
     if free < MEMORY_NEEDED:
-        found = f"{readable_bytes(free)} available, quality standard takes up to 4 GB"
+        found = f"{readable_bytes(free)} available, quality standard needs up to 4 GB"
         return Check("memory", None, found, "close other programs, or use --quality draft")
     return Check("memory", True, f"{readable_bytes(free)} available")
 
@@ -252,21 +250,21 @@ def _disk(folder: Path) -> Check:
             "disk",
             False,
             f"{readable_bytes(free)} free in {folder.resolve()}",
-            "free 1 GB there, or use -o on another disk",
+            "free 1 GB, or use -o on another disk",
         )
     return Check("disk", True, f"{readable_bytes(free)} free in {folder.resolve()}")
 
 
 def _cache() -> Check:
-    """Dr.Jit keeps compiled kernels in ~/.drjit; without it every start compiles anew."""
+    """Dr.Jit caches compiled kernels in ~/.drjit; without it each start compiles all kernels."""
     home = Path(os.path.expanduser("~")) / ".drjit"
     try:
         home.mkdir(exist_ok=True)
         with tempfile.TemporaryFile(dir=home):
             pass
     except OSError as error:
-        found = f"{home} cannot be written ({error.strerror}): every start compiles all kernels"
-        return Check("kernel cache", None, found, "export HOME=/a/folder/of/yours")
+        found = f"{home} is not writable ({error.strerror}): each start compiles all kernels"
+        return Check("kernel cache", None, found, "export HOME=/path/to/a/writable/folder")
     return Check("kernel cache", True, str(home))
 
 
@@ -283,14 +281,14 @@ def _extras() -> list[Check]:
 
     node = shutil.which("node")
     return [
-        module("ffmpeg", ("imageio_ffmpeg",), "imageio-ffmpeg", "H.264 videos (else MPEG-4)"),
+        module("ffmpeg", ("imageio_ffmpeg",), "imageio-ffmpeg", "H.264 videos (otherwise MPEG-4)"),
         module(
             "segmenter",
             ("rembg", "onnxruntime"),
             "rembg onnxruntime",
-            "masks of photos without any hint",
+            "masks by a segmentation network",
         ),
-        module("HEIC", ("pillow_heif",), "pillow-heif", "photos of iPhones"),
+        module("HEIC", ("pillow_heif",), "pillow-heif", "HEIC photos of phones"),
         module("RAW", ("rawpy",), "rawpy", "raw photos of cameras"),
         Check("node", True, node)
         if node

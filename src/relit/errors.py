@@ -1,4 +1,4 @@
-"""What Relit tells a user who cannot go on: what happened, why, and how to mend it."""
+"""Errors that a user can fix: what happened, why, and how to fix it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ EXIT_ENVIRONMENT = 5  # libLLVM, CUDA, memory, disk
 
 
 class UserError(Exception):
-    """A mistake or a lack on the user's side, said once and in full.
+    """An error that the user can fix, reported once.
 
     Args:
-        what: what went wrong, one sentence, with the numbers that show it.
+        what: what went wrong, one sentence with the relevant numbers.
         why: the likely cause.
-        fix: what to do, a command where there is one. Paths come last.
+        fix: what to do, a command where possible. Paths come last.
         code: the exit code of the command line (one of the `EXIT_*` above).
     """
 

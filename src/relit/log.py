@@ -1,6 +1,6 @@
-"""What a job says while it runs: log lines, a progress line, and how much memory it holds.
+"""Log lines, progress lines and memory use of a job.
 
-Everything here goes to stderr, so that a command's result on stdout can be piped.
+All output goes to stderr, so that a command's result on stdout can be piped.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ PLAIN_SECONDS = 10.0  # a progress line in a file or a pipe
 
 
 class Log:
-    """Lines for the reader: on `stream` as they are, in the file `path` with the time in front.
+    """Log lines, written to `stream` unchanged and to the file `path` with a time stamp.
 
-    Not safe to share between processes; the file is opened for each line, so it may be moved or
-    read meanwhile.
+    Not safe to share between processes. The file is opened for each line, so it may be moved or
+    read at any time.
     """
 
     def __init__(self, path: Path | None = None, stream: TextIO | None = None):
@@ -51,17 +51,17 @@ class Log:
         self._drawn = len(text)
 
     def clear(self) -> None:
-        """Take the progress line away."""
+        """Erase the progress line."""
         if self._drawn:
             print("\r" + " " * self._drawn + "\r", end="", file=self.stream, flush=True)
             self._drawn = 0
 
 
 class Progress:
-    """Stage, step, rate and time left: one line redrawn on a terminal, a plain line every 10 s
-    elsewhere.
+    """Stage, step, rate and time left: one line that is redrawn on a terminal, a new line every
+    10 s otherwise.
 
-    title: what the reader sees. steps: how many there will be, or None when not known.
+    title: name of the stage. steps: their total number, or None if unknown.
     """
 
     def __init__(self, log: Log, title: str, steps: int | None):
@@ -73,7 +73,7 @@ class Progress:
         self._shown = time.monotonic()
 
     def update(self, done: int, values: dict[str, float] | None = None) -> None:
-        """`done`: steps completed so far, this session's and earlier ones together."""
+        """done: steps completed so far, including those before a resume."""
         now = time.monotonic()
         if self._first is None:
             self._first = self._window = (now, done)
@@ -113,8 +113,7 @@ class Progress:
 
 @contextmanager
 def counted(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Gives what is to be called with (done, all) and shows it as a progress line; all may
-    change."""
+    """A progress line as a function of (done, total); the total may change."""
     progress = Progress(Log(), title, None)
 
     def show(done: int, count: int) -> None:
@@ -145,8 +144,7 @@ def peak_memory() -> int:
 
 
 def available_memory() -> int | None:
-    """Bytes that can be used without swapping (the container's limit counted), or None where the
-    system does not tell."""
+    """Bytes available without swapping, within the container's limit, or None if unknown."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
@@ -165,8 +163,8 @@ def available_memory() -> int | None:
 class MemoryWatch:
     """Peak resident memory between `start()` and `stop()`, bytes, by sampling twice a second.
 
-    A new maximum of the whole process is exact (the kernel keeps it); a stage that stays below an
-    earlier one's is sampled.
+    A new maximum of the process is exact (recorded by the kernel); a stage below an earlier maximum
+    is sampled.
     """
 
     def start(self) -> MemoryWatch:

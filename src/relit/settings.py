@@ -1,5 +1,5 @@
-"""Settings of a recipe: a flat frozen dataclass, changed by `--set key=value` or a TOML file, each
-value checked against its type."""
+"""Options of a recipe: a flat frozen dataclass, changed by `--set key=value` or a TOML file. Values
+are checked against their types."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def with_pairs(options, pairs: Iterable[str], prefix: str = "--set"):
         key, equals, text = pair.partition("=")
         if not equals:
             raise UserError(
-                f"{prefix} {pair}: no '=' in it", fix=f"{prefix} key=value", code=EXIT_USAGE
+                f"{prefix} {pair}: '=' is missing", fix=f"{prefix} key=value", code=EXIT_USAGE
             )
         changes[key.strip()] = text.strip()
     return with_values(options, changes, prefix)
@@ -29,7 +29,7 @@ def with_pairs(options, pairs: Iterable[str], prefix: str = "--set"):
 
 def with_values(options, values: dict, source: str):
     """`options` with {key: value} applied; values are texts (from the command line) or TOML values.
-    `source` is named in errors."""
+    source: named in errors."""
     hints = typing.get_type_hints(type(options))
     changes = {}
     for key, value in values.items():
@@ -39,7 +39,7 @@ def with_values(options, values: dict, source: str):
         try:
             changes[key] = convert(value, hints[key])
         except ValueError:
-            what = f"{source}: {key}={value} is no {describe(hints[key])}"
+            what = f"{source}: {key}={value} is not valid; expected {type_name(hints[key])}"
             raise UserError(
                 what, f"{key} is {getattr(options, key)!r} by default", code=EXIT_USAGE
             ) from None
@@ -51,8 +51,7 @@ def with_values(options, values: dict, source: str):
 
 
 def preset(quality: str, presets: dict[str, dict]) -> dict:
-    """What a recipe's options are at 'draft', 'standard' or 'high'. Raises UserError (code 2) for
-    others."""
+    """A recipe's options at 'draft', 'standard' or 'high'. Raises UserError (code 2) for others."""
     if quality not in presets:
         what = f"quality '{quality}' is not known.{did_you_mean(quality, presets)}"
         raise UserError(what, fix=f"one of: {', '.join(presets)}", code=EXIT_USAGE)
@@ -60,8 +59,7 @@ def preset(quality: str, presets: dict[str, dict]) -> dict:
 
 
 def check_parts(without: Iterable[str], known: Iterable[str]) -> None:
-    """Raises ValueError for a part that a recipe does not know how to leave out (its option
-    `without`)."""
+    """Raises ValueError for a part that a recipe cannot switch off (its option `without`)."""
     for name in without:
         if name not in known:
             raise ValueError(
@@ -70,8 +68,7 @@ def check_parts(without: Iterable[str], known: Iterable[str]) -> None:
 
 
 def check_levels(options) -> None:
-    """Raises UserError (code 2) for options of a recipe whose volume pass has not one number of
-    steps for each level."""
+    """Raises UserError (code 2) unless `level_steps` has one entry for each of `levels`."""
     if len(options.levels) != len(options.level_steps):
         raise UserError(
             "levels and level_steps differ in length",
@@ -148,28 +145,28 @@ def _fail():
     raise ValueError
 
 
-def describe(hint) -> str:
+def type_name(hint) -> str:
     """'whole number', 'true or false', 'draft, standard or high'."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join("none" if a is type(None) else describe(a) for a in args)
+        return " or ".join("none" if a is type(None) else type_name(a) for a in args)
     if origin is typing.Literal:
         return "one of " + ", ".join(str(a) for a in args)
     if origin in (tuple, list):
-        return f"list of {describe(args[0])}"
+        return f"list of {type_name(args[0])}"
     return {bool: "true or false", int: "whole number", float: "number", str: "text"}.get(
         hint, str(hint)
     )
 
 
 def read_config(path: str | Path) -> dict:
-    """A TOML file as a dictionary. Raises UserError (code 2) when it is not there or no TOML."""
+    """A TOML file as a dictionary. Raises UserError (code 2) when it is missing or malformed."""
     path = Path(path)
     try:
         return parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(
-            "the configuration file is not there", fix=f"check the path: {path}", code=EXIT_USAGE
+            "the configuration file does not exist", fix=f"check the path: {path}", code=EXIT_USAGE
         ) from None
     except (OSError, ValueError) as error:
         what = f"the configuration file cannot be read: {error}"

@@ -14,9 +14,9 @@ from relit.cli import main as cli
 from relit.conventions import srgb_from_linear, world_from_gl_camera
 from relit.errors import UserError
 from relit.geometry.se3 import look_at
-from relit.preflight.cameras import fundamental, match, widest_gap
-from relit.preflight.drift import drift, warnings_of
-from relit.preflight.inspect import inspect
+from relit.preflight.cameras import fundamental, match, widest_view_gap
+from relit.preflight.drift import drift, drift_warnings
+from relit.preflight.inspect import inspect_input
 from relit.preflight.light import LIMB, check_flash_light, light_regime, limb_slopes, shading_fits
 from relit.preflight.look import Exif, look_at_photos, read_exif, sharpness
 from relit.scene import Camera, Capture, Photo, Pixels, Sphere
@@ -98,13 +98,15 @@ def test_light_regimes(tmp_path):
     assert (
         dark["guess"] == "flash"
         and dark["confidence"] > 0.5
-        and any("moves with it" in e for e in dark["evidence"])
+        and any("moves with the camera" in e for e in dark["evidence"])
     )
     colours = np.random.default_rng(3).uniform(0.02, 0.8, (12, 3))
     varied = light_regime(capture(tmp_path, [sun(i) for i in range(12)], colours))
     assert varied["guess"] == "varied"
     moving = light_regime(capture(tmp_path, [sun(i) for i in range(6)], same=True))
-    assert moving["guess"] == "moving light" and any("one place" in e for e in moving["evidence"])
+    assert moving["guess"] == "moving light" and any(
+        "one viewpoint" in e for e in moving["evidence"]
+    )
     assert (
         light_regime(capture(tmp_path, [fixed] * 6, same=True))["guess"] == "fixed"
     )  # a tripod alone is no moving lamp
@@ -124,7 +126,7 @@ def test_light_regimes_without_cameras(tmp_path):
     assert moving["guess"] == "moving light"
 
 
-def test_shading_is_told_from_texture(tmp_path):
+def test_shading_is_separated_from_texture(tmp_path):
     spread, camera, _, facing = shading_fits(look_at_photos(capture(tmp_path, [flash] * 12)), BALL)
     assert spread > 0.2 and camera > 0.6 and facing > 0.5
     _, camera, photo, _ = shading_fits(
@@ -136,7 +138,7 @@ def test_shading_is_told_from_texture(tmp_path):
     assert shading_fits(look_at_photos(capture(tmp_path, [fixed] * 2)), BALL) is None
 
 
-def test_a_lamp_at_the_camera_is_told_from_the_outline(tmp_path):
+def test_lamp_at_the_camera_from_limb_darkening(tmp_path):
     """Without cameras or dark surroundings: only under a flash does the object darken evenly
     towards its outline."""
     slopes = limb_slopes(look_at_photos(capture(tmp_path, [flash] * 8, with_cameras=False)))
@@ -158,7 +160,7 @@ def told(capture):
     return said
 
 
-def test_a_flash_capture_is_let_through(tmp_path):
+def test_flash_capture_is_accepted(tmp_path):
     assert told(capture(tmp_path, [flash] * 8, [(0.002,) * 3] * 8)) == []
     assert (
         told(capture(tmp_path, [flash] * 8, with_cameras=False)) == []
@@ -166,29 +168,31 @@ def test_a_flash_capture_is_let_through(tmp_path):
 
 
 @pytest.mark.parametrize("with_cameras", [True, False])
-def test_light_that_stands_still_is_no_flash(tmp_path, with_cameras):
-    with pytest.raises(UserError, match="does not move with the camera: it looks fixed") as error:
+def test_fixed_light_is_refused_as_flash(tmp_path, with_cameras):
+    with pytest.raises(
+        UserError, match="does not move with the camera: it appears to be fixed"
+    ) as error:
         told(capture(tmp_path, [fixed] * 14, [(0.0,) * 3] * 14, with_cameras=with_cameras))
     assert "--capture multiview" in error.value.fix and "check_light=false" in error.value.fix
 
 
 def test_few_photos_are_not_refused(tmp_path):
     said = told(capture(tmp_path, [fixed] * 8, [(0.2,) * 3] * 8))
-    assert len(said) == 1 and "does not look like a flash" in said[0]
+    assert len(said) == 1 and "may not be a flash" in said[0]
 
 
-def test_one_viewpoint_under_a_moving_lamp_is_no_flash_capture(tmp_path):
+def test_fixed_viewpoint_with_moving_lamp_is_refused_as_flash(tmp_path):
     with pytest.raises(
-        UserError, match="all photos are taken from one place, under a light that moves"
+        UserError, match="all photos are taken from one viewpoint, under a light that moves"
     ):
         told(
             capture(tmp_path, [sun(i) for i in range(6)], same=True, with_cameras=False, mask=False)
         )
 
 
-def test_what_is_uncertain_about_a_flash_is_said(tmp_path):
+def test_uncertain_flash_gives_a_note(tmp_path):
     said = told(capture(tmp_path, [fixed] * 8, mask=False))
-    assert len(said) == 1 and "does not look like a flash" in said[0]
+    assert len(said) == 1 and "may not be a flash" in said[0]
 
 
 def with_alpha(folder, light):
@@ -207,7 +211,7 @@ def with_alpha(folder, light):
     return folder
 
 
-def test_the_light_is_looked_at_before_a_flash_reconstruction(tmp_path, monkeypatch):
+def test_light_is_checked_before_a_flash_reconstruction(tmp_path, monkeypatch):
     """The environment-lit set with alpha is refused before anything is computed, and goes on when
     asked to; a flash set goes on."""
     from relit.fit.flash import recipe
@@ -232,7 +236,7 @@ def test_the_light_is_looked_at_before_a_flash_reconstruction(tmp_path, monkeypa
         reconstruct(tmp_path / "flash", tmp_path / "run3", **job)
 
 
-def test_the_mug_is_told_about_its_light_first(shared, tmp_path):
+def test_light_regime_of_the_mug(shared, tmp_path):
     from relit.reconstruction import reconstruct
 
     with pytest.raises(UserError, match="taken from one place, under a light that moves"):
@@ -267,14 +271,14 @@ def test_blur_exposure_and_tint_are_found(tmp_path):
     )
     assert found["exif_exposure_spread"] is None and found["cameras"] == []
     shifted = found | {"exif_exposure_spread": 1.4, "tint_spread": 1.0}
-    said = [w["what"] for w in warnings_of(shifted, True)]
-    assert len(said) == 3 and "exposure: 1.4 EV" in said[0] and "colour varies" in said[1]
-    assert [w["what"] for w in warnings_of(shifted, True, from_anywhere=True)] == said[
+    said = [w["what"] for w in drift_warnings(shifted, True)]
+    assert len(said) == 3 and "exposure varies by 1.4 EV" in said[0] and "colour varies" in said[1]
+    assert [w["what"] for w in drift_warnings(shifted, True, from_anywhere=True)] == said[
         2:
     ]  # photos from anywhere differ in both
 
 
-def test_sharpness_is_of_the_photo_not_of_what_it_shows():
+def test_sharpness_is_independent_of_content():
     rng = np.random.default_rng(0)
     noise = cv2.GaussianBlur(rng.random((120, 120, 3)).astype(np.float32), (0, 0), 0.8)
     faint = 0.5 + 0.1 * (noise - 0.5)
@@ -282,7 +286,7 @@ def test_sharpness_is_of_the_photo_not_of_what_it_shows():
     assert sharpness(cv2.GaussianBlur(noise, (0, 0), 2), None) < 0.5 * sharpness(noise, None)
 
 
-def test_exif_is_read_and_damage_is_survived(tmp_path):
+def test_exif_of_good_and_damaged_files(tmp_path):
     image, exif = Image.new("RGB", (32, 32), (90, 90, 90)), Image.Exif()
     exif[0x010F], exif[0x0110] = "Maker", "Model 1"
     exif.get_ifd(0x8769).update({0x829A: 0.01, 0x829D: 4.0, 0x8827: 400, 0x9209: 1})
@@ -343,13 +347,13 @@ def write(folder, n=24, turned=0.0, side=256):
     return folder
 
 
-def test_cameras_that_do_not_belong_to_the_photos(tmp_path):
+def test_cameras_of_other_photos_give_a_warning(tmp_path):
     from relit.job import Job
 
-    right = inspect(write(tmp_path / "right"), Job(masks="none"))
+    right = inspect_input(write(tmp_path / "right"), Job(masks="none"))
     assert right["epipolar"]["share"] > 0.9 and right["epipolar"]["median"] < 0.5
     assert not [w for w in right["warnings"] if "epipolar" in w["what"]]
-    wrong = inspect(write(tmp_path / "wrong", turned=0.6), Job(masks="none"))
+    wrong = inspect_input(write(tmp_path / "wrong", turned=0.6), Job(masks="none"))
     assert wrong["epipolar"]["share"] < 0.5 and [
         w for w in wrong["warnings"] if "epipolar" in w["what"]
     ]
@@ -367,8 +371,13 @@ def test_widest_gap():
     ring = np.array(
         [[np.cos(a), 0, np.sin(a)] for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)]
     )
-    assert widest_gap(ring) == pytest.approx(90, abs=5)  # nobody looked from above
-    assert widest_gap(ring[:6]) > 80 > 60 > widest_gap(np.concatenate([ring, ring[:, [1, 0, 2]]]))
+    assert widest_view_gap(ring) == pytest.approx(90, abs=5)  # nobody looked from above
+    assert (
+        widest_view_gap(ring[:6])
+        > 80
+        > 60
+        > widest_view_gap(np.concatenate([ring, ring[:, [1, 0, 2]]]))
+    )
 
 
 def test_the_page(tmp_path, capsys):
@@ -396,7 +405,7 @@ def planned(capsys, folder, *flags):
     return json.loads(out.out)
 
 
-def test_an_input_is_planned_as_what_it_is_said_to_be(tmp_path, capsys):
+def test_plan_follows_the_capture_flag(tmp_path, capsys):
     """Photos with cameras in files that tell no kind: stages, cost, and the light that is expected
     are those of --capture."""
     folder = write(tmp_path / "photos", n=6, side=96)
@@ -422,7 +431,7 @@ def test_an_input_is_planned_as_what_it_is_said_to_be(tmp_path, capsys):
     )
 
 
-def test_a_photo_of_duplicates_is_planned_by_its_segmenter(tmp_path, capsys, monkeypatch):
+def test_plan_of_duplicates_with_a_segmenter(tmp_path, capsys, monkeypatch):
     """--masks segment:FILE.onnx and --focal reach the reader, as in `relit reconstruct`."""
     import relit.capture.readers.sfd as sfd
 

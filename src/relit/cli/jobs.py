@@ -33,8 +33,8 @@ def do_doctor(args) -> int:
     from relit import doctor
 
     checks = doctor.examine()
-    print(doctor.as_json(checks) if args.json else doctor.as_text(checks))
-    return doctor.verdict(checks)
+    print(doctor.doctor_json(checks) if args.json else doctor.doctor_text(checks))
+    return doctor.doctor_exit_code(checks)
 
 
 def demo_flags(parser: Parser) -> None:
@@ -88,7 +88,7 @@ def inspect_flags(parser: Parser) -> None:
 
 def do_inspect(args) -> None:
     from relit.job import Job
-    from relit.preflight.inspect import as_text, inspect
+    from relit.preflight.inspect import inspect_input, inspection_text
 
     for path in (args.plot, args.html):
         if path is not None:
@@ -104,8 +104,8 @@ def do_inspect(args) -> None:
         return serve_until_stopped(
             server, lambda text: print(text, flush=True), not args.no_browser
         )
-    found = inspect(args.input, job, args.plot, args.html)
-    print(json.dumps(found, indent=2) if args.json else as_text(found))
+    found = inspect_input(args.input, job, args.plot, args.html)
+    print(json.dumps(found, indent=2) if args.json else inspection_text(found))
 
 
 # ---------------------------------------------------------------- reconstruct

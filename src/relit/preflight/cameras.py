@@ -20,9 +20,9 @@ SHARE = 0.5  # of the matches that lie near their lines when the cameras are rig
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Two photos whose points were matched. points: (N, 2, 2) pixels of the small copies. distance:
-    (N,) pixels to the epipolar line in the second, as the given cameras have it."""
+class MatchedPair:
+    """Two matched photos. points: (N, 2, 2) pixels of the downscaled copies. distance: (N,) pixels
+    to the epipolar line in the second photo, from the given cameras."""
 
     first: Look
     second: Look
@@ -39,7 +39,7 @@ def fundamental(first: Camera, second: Camera) -> np.ndarray:
     return np.linalg.inv(second.intrinsics).T @ cross @ r @ np.linalg.inv(first.intrinsics)
 
 
-def match(first: Look, second: Look) -> Pair | None:
+def match(first: Look, second: Look) -> MatchedPair | None:
     """SIFT matches (ratio test, mutual) of two photos and their distances to the epipolar lines, or
     None for too few."""
     sift = cv2.SIFT_create(nfeatures=1500)
@@ -64,18 +64,17 @@ def match(first: Look, second: Look) -> Pair | None:
     both = [(i, j) for i, j in there.items() if back.get(j) == i]
     if len(both) < LEAST:
         return None
-    points = (
-        np.array([[ka[i].pt, kb[j].pt] for i, j in both]) + 0.5
-    )  # OpenCV counts from the centre of the first pixel
+    # OpenCV's origin is the centre of the first pixel
+    points = np.array([[ka[i].pt, kb[j].pt] for i, j in both]) + 0.5
     p, q = (np.concatenate([points[:, k], np.ones((len(points), 1))], 1) for k in (0, 1))
     line = p @ fundamental(first.camera, second.camera).T
     distance = np.abs((q * line).sum(1)) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
-    return Pair(first, second, points, distance)
+    return MatchedPair(first, second, points, distance)
 
 
-def pairs_of(looks: list[Look]) -> list[Pair]:
-    """Neighbouring views, matched: each of a few evenly chosen photos with the one whose optical
-    axis is nearest to its own."""
+def matched_pairs(looks: list[Look]) -> list[MatchedPair]:
+    """Matched pairs of neighbouring views: each of a few evenly spaced photos with the photo of the
+    nearest optical axis."""
     seen = [x for x in looks if x.camera is not None]
     axes = np.array([x.camera.world_from_camera[:3, 2] for x in seen])
     if len(seen) < 2:
@@ -98,14 +97,14 @@ def pairs_of(looks: list[Look]) -> list[Pair]:
     return [m for m in matched if m is not None]
 
 
-def agreement(looks: list[Look]) -> tuple[dict | None, list[Pair]]:
-    """({pairs, matches, median (pixels of the small copies), share (near their lines)}, the pairs);
-    None when nothing could be matched."""
-    pairs = pairs_of(looks)
+def epipolar_agreement(looks: list[Look]) -> tuple[dict | None, list[MatchedPair]]:
+    """({pairs, matches, median (pixels of the downscaled copies), share (near their epipolar
+    lines)}, the pairs); None without matches."""
+    pairs = matched_pairs(looks)
     if not pairs:
         return None, []
     near = [p.distance < AGREES * max(p.second.gray.shape) for p in pairs]
-    # a wrong match may lie anywhere, so the distance is told of those that are near
+    # a wrong match can lie anywhere, so the median is over matches near their lines
     good = np.concatenate([p.distance[n] for p, n in zip(pairs, near, strict=True)])
     share = float(np.concatenate(near).mean())
     median = float(np.median(good)) if len(good) else None
@@ -118,8 +117,7 @@ def agreement(looks: list[Look]) -> tuple[dict | None, list[Pair]]:
 
 
 def reprojection(capture: Capture, looks: list[Look]) -> dict | None:
-    """Of the sparse points that came with the cameras, the share that lies in the pictures, and on
-    the masks where there are some."""
+    """Share of the given sparse points that project into the images."""
     if capture.points is None or len(capture.points) == 0:
         return None
     points = capture.points[:: max(1, len(capture.points) // 5000)]
@@ -151,15 +149,14 @@ def reprojection(capture: Capture, looks: list[Look]) -> dict | None:
     )
 
 
-def coverage(capture: Capture) -> dict | None:
-    """How the cameras stand round the object sphere: share of the frame's shorter side that its
-    diameter takes, photos that cut it off, the widest gap between neighbouring views."""
+def camera_coverage(capture: Capture) -> dict | None:
+    """Coverage of the object sphere by the cameras: its diameter as a share of the frame's shorter
+    side, photos that crop it, the widest gap between views."""
     if not capture.has_cameras or capture.sphere is None:
         return None
     sphere, cameras = capture.sphere, [p.camera for p in capture.photos]
-    guessed = any(
-        "viewing directions" in note for note in capture.notes
-    )  # as large as the photos show: they cannot cut it off
+    # a sphere that was sized by the photos' frames cannot be cropped by them
+    guessed = any("viewing directions" in note for note in capture.notes)
     fill, cut, towards = [], [], []
     for photo, camera in zip(capture.photos, cameras, strict=True):
         x, y, z = camera.project(sphere.centre)
@@ -182,38 +179,40 @@ def coverage(capture: Capture) -> dict | None:
         "fill": round(float(np.median(fill)), 3),
         "cut": cut,
         "photos": len(capture.photos),
-        "widest_gap": round(widest_gap(np.array(towards)), 1),
+        "widest_gap": round(widest_view_gap(np.array(towards)), 1),
     }
 
 
-def widest_gap(towards: np.ndarray) -> float:
-    """Degrees from the direction least looked from, on the side of the mean view, to the nearest
-    view. towards: (N, 3) unit."""
+def widest_view_gap(towards: np.ndarray) -> float:
+    """Largest angle in degrees from a direction, on the hemisphere of the mean view, to the nearest
+    view. towards: (N, 3) unit vectors from the object to the cameras."""
     axis = towards.mean(0)
     n = 600
     z = 1 - 2 * (np.arange(n) + 0.5) / n
     phi = np.pi * (1 + 5**0.5) * np.arange(n)
     s = np.sqrt(1 - z * z)
     d = np.stack([s * np.cos(phi), s * np.sin(phi), z], 1)
-    if np.linalg.norm(axis) > 0.2:  # nobody photographs from under the table
+    if (
+        np.linalg.norm(axis) > 0.2
+    ):  # the side away from the cameras, such as the underside, does not count
         d = d[d @ axis > 0]
     return float(np.degrees(np.arccos(np.clip((d @ towards.T).max(1).min(), -1, 1))))
 
 
 def sphere_outline(camera: Camera, sphere: Sphere) -> tuple[float, float, float]:
-    """Centre and radius in pixels of the circle that the object sphere about covers."""
+    """Approximate centre and radius in pixels of the projected object sphere."""
     x, y, z = camera.project(sphere.centre)
     return float(x), float(y), float(camera.fx * sphere.radius / max(z, 1e-9))
 
 
-def warnings_of(found: dict | None, around: dict | None) -> list[dict]:
-    """What to say of `agreement` and `coverage`."""
+def camera_warnings(found: dict | None, around: dict | None) -> list[dict]:
+    """Warnings for the results of `epipolar_agreement` and `camera_coverage`."""
     out = []
     if found is not None and found["matches"] >= LEAST and found["share"] < SHARE:
         out.append(
             {
                 "what": f"only {100 * found['share']:.0f} % of the matches between neighbouring photos lie near their epipolar lines",
-                "fix": "the cameras do not belong to these photos, or use other axes or intrinsics than the format says",
+                "fix": "check that the cameras belong to these photos, and their axes and intrinsics",
             }
         )
     if around is not None:
@@ -221,19 +220,21 @@ def warnings_of(found: dict | None, around: dict | None) -> list[dict]:
             out.append(
                 {
                     "what": f"the object sphere fills {100 * around['fill']:.0f} % of the frame",
-                    "fix": "go closer, or give --sphere",
+                    "fix": "move closer, or give --sphere",
                 }
             )
         if len(around["cut"]) > 0.5 * around["photos"]:
             out.append(
                 {
-                    "what": f"{len(around['cut'])} photos cut the middle of the object sphere off",
-                    "fix": "step back, or give --sphere",
+                    "what": f"{len(around['cut'])} photos crop the centre of the object sphere",
+                    "fix": "move back, or give --sphere",
                 }
             )
         if around["widest_gap"] > 75:
             what = (
-                f"no photo looks from within {around['widest_gap']:.0f} degrees of some directions"
+                f"the nearest photo to some directions is {around['widest_gap']:.0f} degrees away"
             )
-            out.append({"what": what, "fix": "the far side is guessed; go all around"})
+            out.append(
+                {"what": what, "fix": "photograph from all around; unseen sides are extrapolated"}
+            )
     return out

@@ -1,4 +1,4 @@
-"""Exposure, white balance and sharpness from photo to photo."""
+"""Variation of exposure, white balance and sharpness between photos."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ TINT_DRIFT = 0.1  # log2 of red or blue over green, standard deviation
 
 
 def drift(looks: list[Look]) -> dict:
-    """Per photo: exposure (EV against the median, of what is on the object or in the whole
-    picture), red and blue against green (log2, against the median), sharpness (against the median),
-    EXIF exposure. Over all: their spreads, and the blurred photos."""
+    """Per photo, relative to the median: exposure (EV, inside the mask or of the whole image), red
+    and blue over green (log2), sharpness; and EXIF exposure. Over all photos: standard deviations,
+    and the blurred photos."""
     level, red, blue = (np.array(a) for a in zip(*[_colour(x) for x in looks], strict=True))
     level, red, blue = level - np.median(level), red - np.median(red), blue - np.median(blue)
     sharp = np.array([x.sharpness for x in looks])
@@ -49,9 +49,8 @@ def _colour(x: Look) -> tuple[float, float, float]:
         else x.mask > 0.9
     )
     gray = x.gray[inside]
-    low, high = np.percentile(
-        gray, (5, 95)
-    )  # without highlights and holes; a median jumps between the colours of a pattern
+    # a trimmed mean: the median would jump between the colours of a pattern
+    low, high = np.percentile(gray, (5, 95))
     r, g, b = np.log2(np.maximum(x.rgb[inside][(gray >= low) & (gray <= high)].mean(0), 1e-4))
     return (
         float(np.log2(max(float(np.array([0.2126, 0.7152, 0.0722]) @ np.exp2([r, g, b])), 1e-4))),
@@ -60,14 +59,14 @@ def _colour(x: Look) -> tuple[float, float, float]:
     )
 
 
-def warnings_of(found: dict, has_masks: bool, from_anywhere: bool = False) -> list[dict]:
-    """What to say of `drift`'s answer. from_anywhere: each photo has an exposure and a white of its
-    own (a collection)."""
+def drift_warnings(found: dict, has_masks: bool, from_anywhere: bool = False) -> list[dict]:
+    """Warnings for a result of `drift`. from_anywhere: exposure and white balance may differ per
+    photo (a collection)."""
     out = [] if from_anywhere else _unsteady(found, has_masks)
     if found["blurred"]:
         listed = ", ".join(found["blurred"][:5]) + (" ..." if len(found["blurred"]) > 5 else "")
-        what = f"{len(found['blurred'])} photos are less sharp than the others: {listed}"
-        out.append({"what": what, "fix": "leave them out, or take them again"})
+        what = f"{len(found['blurred'])} photos are blurred compared to the others: {listed}"
+        out.append({"what": what, "fix": "remove them or take them again"})
     return out
 
 
@@ -75,14 +74,14 @@ def _unsteady(found: dict, has_masks: bool) -> list[dict]:
     out = []
     spread = found["exif_exposure_spread"]
     if spread is not None and spread > EXPOSURE_DRIFT:
-        what = f"the camera changed its exposure: {spread:.1f} EV from photo to photo (EXIF)"
+        what = f"exposure varies by {spread:.1f} EV between photos (EXIF)"
         out.append(
-            {"what": what, "fix": "lock exposure; until then the light's brightness is an average"}
+            {"what": what, "fix": "lock exposure; otherwise the light's intensity is an average"}
         )
     elif spread is None and has_masks and found["exposure_spread"] > 3.5 * EXPOSURE_DRIFT:
-        what = f"the object's brightness varies by {found['exposure_spread']:.1f} EV from photo to photo"
-        out.append({"what": what, "fix": "lock exposure, or look at the light regime"})
+        what = f"the object's brightness varies by {found['exposure_spread']:.1f} EV between photos"
+        out.append({"what": what, "fix": "lock exposure, or check the light regime"})
     if has_masks and found["tint_spread"] > 4.5 * TINT_DRIFT:
         what = f"the object's colour varies by {found['tint_spread']:.2f} (log2) between photos"
-        out.append({"what": what, "fix": "lock white balance; mixed light shows so as well"})
+        out.append({"what": what, "fix": "lock white balance; mixed light has the same effect"})
     return out

@@ -1,4 +1,4 @@
-"""What an input was recognised as, and what a reconstruction of it would take. `relit inspect`."""
+"""Checks of an input before a reconstruction: format, cameras, masks, light, cost. `relit inspect`."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ import numpy as np
 from relit.errors import UserError
 from relit.files import write_text
 from relit.job import Job, estimate, open_as, recipe_of
-from relit.preflight.cameras import agreement, coverage, reprojection
-from relit.preflight.cameras import warnings_of as camera_warnings
-from relit.preflight.drift import drift
-from relit.preflight.drift import warnings_of as drift_warnings
+from relit.preflight.cameras import (
+    camera_coverage,
+    camera_warnings,
+    epipolar_agreement,
+    reprojection,
+)
+from relit.preflight.drift import drift, drift_warnings
 from relit.preflight.light import light_regime
 from relit.preflight.look import Look, look_at_photos
 from relit.preflight.page import write_page
-from relit.preflight.text import as_text
+from relit.preflight.text import inspection_text
 from relit.scene import Capture
 
-__all__ = ["as_text", "inspect", "light_regime", "write_plot"]
+__all__ = ["inspect_input", "inspection_text", "light_regime", "write_plot"]
 
 
-def inspect(
+def inspect_input(
     input: str | Path, job: Job, plot: Path | None = None, html: Path | None = None
 ) -> dict:
-    """What the input was recognised as, what stands in it and what is odd about it, and what a
-    reconstruction would take.
+    """The format of an input, its content, warnings, and the estimated cost of a reconstruction.
 
-    plot: an SVG file for the cameras. html: a page with pictures of all that was looked at.
+    plot: SVG file for the cameras. html: page with images of all checks. Returns what
+    `relit inspect --json` prints.
     """
     capture, kind = open_as(Path(input), job)
     recipe = recipe_of(kind)
@@ -42,8 +45,12 @@ def inspect(
         "radius": float(capture.sphere.radius),
     }
     looks = look_at_photos(capture)
-    regime, drifts, (epipolar, pairs) = light_regime(capture, looks), drift(looks), agreement(looks)
-    around, masks = coverage(capture), mask_coverage(looks)
+    regime, drifts, (epipolar, pairs) = (
+        light_regime(capture, looks),
+        drift(looks),
+        epipolar_agreement(looks),
+    )
+    around, masks = camera_coverage(capture), mask_coverage(looks)
     unsteady = drift_warnings(drifts, masks is not None, from_anywhere=kind == "collection")
     found = {
         "input": str(input),
@@ -52,7 +59,9 @@ def inspect(
         "held_out": len(capture.held_out),
         "looked_at": len(looks),
         "sizes": [list(s) for s in sizes],
-        "cameras": "given" if capture.has_cameras else "none; they would be found from the photos",
+        "cameras": "given"
+        if capture.has_cameras
+        else "none; structure from motion will estimate them",
         "sphere": ball,
         "coverage": around,
         "epipolar": epipolar,
@@ -86,39 +95,38 @@ EXPECTED = {
 
 
 def _of_light(kind: str, regime: dict) -> list[dict]:
-    """A warning where the light looks like another kind of capture than the one that would be
-    run."""
+    """A warning where the estimated light regime contradicts the kind of capture."""
     guess = regime["guess"]
     if guess in EXPECTED.get(kind, (guess,)) or regime["confidence"] < 0.25:
         return []
     advice = {
-        "flash": "if a flash at the camera was the only light: --capture flash",
-        "varied": "if each photo has another light: --capture collection",
-        "moving light": "one viewpoint with a moving lamp is not reconstructed: photograph from all around",
-        "fixed": "if the lamps stood still: --capture multiview",
+        "flash": "use --capture flash if a flash at the camera was the only light",
+        "varied": "use --capture collection if each photo has its own light",
+        "moving light": "a fixed viewpoint with a moving lamp is not supported: photograph from all around",
+        "fixed": "use --capture multiview if the lamps did not move",
     }
     looks = guess.removesuffix(" light")
     return [
         {
-            "what": f"the light looks {looks}, and a {kind} capture expects {' or '.join(EXPECTED[kind])} light",
+            "what": f"the light appears to be {looks}; a {kind} capture expects {' or '.join(EXPECTED[kind])} light",
             "fix": advice[guess],
         }
     ]
 
 
 def write_plot(path: Path, capture: Capture) -> None:
-    """An SVG file of the cameras around the object sphere, from above and from the side. Raises
-    UserError when either is not known."""
+    """Write an SVG file of the cameras around the object sphere, from above and from the side.
+    Raises UserError when cameras or sphere are unknown."""
     if not capture.has_cameras or capture.sphere is None:
-        what = "there is nothing to plot: the cameras are not known yet"
+        what = "the cameras are unknown, so there is nothing to plot"
         raise UserError(
-            what, "they are found by the reconstruction", "relit reconstruct, then see its report"
+            what, "the reconstruction estimates them", "run relit reconstruct and open its report"
         )
     write_text(path, cameras_svg(capture))
 
 
 def cameras_svg(capture: Capture) -> str | None:
-    """The cameras around the object sphere as SVG, or None when either is not known."""
+    """The cameras around the object sphere as SVG, or None when either is unknown."""
     if not capture.has_cameras or capture.sphere is None:
         return None
     from relit.report.curves import camera_plot
@@ -133,7 +141,7 @@ def cameras_svg(capture: Capture) -> str | None:
 
 
 def _upright(capture: Capture) -> np.ndarray:
-    """(4, 4) rotation that turns the capture's up to +Y."""
+    """(4, 4) rotation of the capture's up direction to +Y."""
     out = np.eye(4)
     if capture.up is not None:
         y = np.asarray(capture.up, np.float64) / np.linalg.norm(capture.up)

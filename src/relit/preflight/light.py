@@ -1,8 +1,8 @@
-"""What kind of light the photos were taken under, guessed before anything is fitted.
+"""Classification of the light regime from the photos, before any fit.
 
-Four regimes: 'fixed' (the object and the lamps stand still, the camera moves), 'flash' (a lamp at
-the camera in a dark room), 'varied' (each photo under another light), 'moving light' (one camera,
-and a lamp that moves). A guess comes with its evidence.
+Four regimes: 'fixed' (object and lamps fixed, camera moves), 'flash' (a lamp at the camera in a
+dark room), 'varied' (each photo under its own light), 'moving light' (fixed camera, moving lamp).
+The evidence is returned with the result.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from relit.scene import Capture, Sphere
 # correlation of edges; .46 for six photos from one tripod under a moving lamp, below .28 where the
 # camera moved
 SAME_VIEW = 0.38
-# overlap of the surroundings' colours; .54 and .70 in one room, .19 to .47 for one object in
-# several places
+# overlap of the background's chromaticity histograms; .54 and .70 in one room, .19 to .47 for one
+# object in several places
 SAME_PLACE = 0.45
-DARK = 0.02  # linear: surroundings of a flash photo
-CELLS = (24, 48)  # of the object sphere's directions
-SAMPLES = 1500  # pixels of a photo
-FOLLOWS = "what faces the camera is brightest: the light moves with it"
-NO_LIMB = 0.6  # below it no lamp stands at the camera
-NO_FRONT = 0.6  # likewise, share of the photos that are lit from the front
-ENOUGH = 12  # photos: in fewer the paint of the object can look like light from a side
-BLACK, BURNT = 0.004, 0.98  # linear: such an object shows no shading
+DARK = 0.02  # linear radiance: background of a flash photo
+CELLS = (24, 48)  # rows, columns of directions on the object sphere
+SAMPLES = 1500  # pixels per photo
+FOLLOWS = "surfaces that face the camera are brightest: the light moves with the camera"
+NO_LIMB = 0.6  # slope below which there is no lamp at the camera; unit as LIMB
+NO_FRONT = 0.6  # share of frontally lit photos below which there is no lamp at the camera
+ENOUGH = 12  # photos; with fewer, texture can be mistaken for directional shading
+BLACK, BURNT = 0.004, 0.98  # linear radiance; beyond these no shading is visible
 # log brightness per unit of an inflated mask's normal, towards the camera; 1.5 to 3 under a flash,
 # below .6 elsewhere
 LIMB = 1.2
@@ -40,23 +40,21 @@ def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
     """{'guess': 'fixed' | 'flash' | 'varied' | 'moving light', 'confidence': 0 to 1, 'evidence':
     [sentences]}.
 
-    looks: the decoded copies, where they are at hand. A guess: photos with an alpha channel and no
-    EXIF and no cameras say little, and then the answer is 'fixed' with low confidence.
+    looks: decoded copies, if available. Photos with an alpha channel but without EXIF and cameras
+    give little evidence; the result is then 'fixed' with low confidence.
     """
     looks = look_at_photos(capture) if looks is None else looks
     evidence: list[str] = []
     votes = {"fixed": 0.4, "flash": 0.0, "varied": 0.0, "moving light": 0.0}
     if len(looks) > 1 and _same_view(looks, evidence):
         changes = shading_change(looks)
-        evidence.append(
-            f"the shading of the same pixel changes by {100 * changes:.0f} % from photo to photo"
-        )
+        evidence.append(f"shading at fixed pixels changes by {100 * changes:.0f} % between photos")
         if changes > 0.08:
             votes["moving light"] += 1.5
     fired = [x.exif.flash for x in looks if x.exif.flash is not None]
     if fired:
         share = float(np.mean(fired))
-        evidence.append(f"EXIF: the flash fired in {100 * share:.0f} % of the photos that say")
+        evidence.append(f"EXIF: the flash fired in {100 * share:.0f} % of the photos with this tag")
         votes["flash"] += 1.0 if share > 0.8 else 0.0
         votes["fixed"] += 0.3 if share < 0.2 else 0.0
     _surroundings(looks, votes, evidence)
@@ -77,12 +75,12 @@ def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
 def check_flash_light(
     capture: Capture, say: Callable[[str], None], looks: list[Look] | None = None
 ) -> None:
-    """Raises UserError where the photos were clearly not lit by a flash at the camera; says so
-    where that is uncertain.
+    """Raises UserError where the photos were clearly not lit by a flash at the camera; prints a
+    note where that is uncertain.
 
-    Clear is one viewpoint under a moving lamp, or, in ENOUGH photos, an object that does not darken
-    towards its outlines: a lamp at the camera makes it, whatever it is made of and whatever
-    surrounds it. looks: as for `light_regime`.
+    Clear cases: one viewpoint under a moving lamp, or, in ENOUGH photos, no darkening of the object
+    towards its outline, which a lamp at the camera causes for any material. looks: as for
+    `light_regime`.
     """
     looks = look_at_photos(capture) if looks is None else looks
     regime, slopes = light_regime(capture, looks), limb_slopes(looks)
@@ -96,27 +94,26 @@ def check_flash_light(
         and np.median(slopes[:, 2]) < NO_LIMB
         and _frontal(slopes) < NO_FRONT
     )
-    if (
-        regime["guess"] == "flash" and not elsewhere
-    ):  # dark surroundings alone are no flash: renderings on black have them too
+    # a dark background alone is not enough: renderings on black have one too
+    if regime["guess"] == "flash" and not elsewhere:
         return
-    onward = "to go on all the same: --set check_light=false"
+    onward = "to skip this check: --set check_light=false"
     if regime["guess"] == "moving light":
         raise UserError(
-            "all photos are taken from one place, under a light that moves from photo to photo",
-            "a flash capture goes around the object, and the light goes with the camera; from one side there is no shape to find",
+            "all photos are taken from one viewpoint, under a light that moves between photos",
+            "a flash capture needs viewpoints all around the object, with the light at the camera",
             f"photograph from all around the object with the flash at the camera; {onward}",
         )
     seen = "; ".join(regime["evidence"])
     if elsewhere:
         raise UserError(
-            f"the light does not move with the camera: it looks {'varied' if regime['guess'] == 'varied' else 'fixed'}",
-            "under a flash an object darkens evenly towards its outline; "
-            f"here it does in {100 * _frontal(slopes):.0f} % of the photos. {seen}",
-            f"take --capture {'collection' if regime['guess'] == 'varied' else 'multiview'}; {onward}",
+            f"the light does not move with the camera: it appears to be {'varied' if regime['guess'] == 'varied' else 'fixed'}",
+            "under a flash at the camera an object darkens evenly towards its outline; "
+            f"this holds in {100 * _frontal(slopes):.0f} % of the photos. {seen}",
+            f"use --capture {'collection' if regime['guess'] == 'varied' else 'multiview'}; {onward}",
         )
     say(
-        f"note: the light does not look like a flash at the camera, which is uncertain ({seen}); if it was none, the material is wrong"
+        f"note: the light may not be a flash at the camera ({seen}); if it is not, the material will be wrong"
     )
 
 
@@ -124,8 +121,7 @@ def check_flash_light(
 
 
 def _same_view(looks: list[Look], evidence: list[str]) -> bool:
-    """Do all photos show the same view? From the poses where they are known, else from the
-    edges."""
+    """Whether all photos show the same view: from the poses where known, otherwise from edges."""
     if all(x.camera is not None for x in looks):
         centres = np.stack([x.camera.centre for x in looks])
         turns = [
@@ -140,17 +136,15 @@ def _same_view(looks: list[Look], evidence: list[str]) -> bool:
         agreement = edge_agreement(looks)
         same = agreement > SAME_VIEW
         if same:
-            evidence.append(
-                f"the edges of the photos lie over one another (correlation {agreement:.2f})"
-            )
+            evidence.append(f"the edges of the photos coincide (correlation {agreement:.2f})")
     if same:
-        evidence.append("all photos are taken from one place")
+        evidence.append("all photos are taken from one viewpoint")
     return bool(same)
 
 
 def edge_agreement(looks: list[Look]) -> float:
-    """Median correlation of the edge maps of neighbouring photos, pixel by pixel: high when the
-    camera did not move."""
+    """Median pixelwise correlation of the edge maps of consecutive photos; high when the camera did
+    not move."""
     maps = []
     for x in looks:
         gray = cv2.resize(np.log(x.gray + 0.01), (128, 128), interpolation=cv2.INTER_AREA)
@@ -163,8 +157,8 @@ def edge_agreement(looks: list[Look]) -> float:
 
 
 def shading_change(looks: list[Look]) -> float:
-    """How much a pixel's share of the picture's brightness varies over photos from one place: upper
-    tenth over bright pixels (of the object where masks are known)."""
+    """Relative variation of normalised pixel brightness over photos from one viewpoint: 90th
+    percentile over bright pixels (inside the masks where there are some)."""
     stack = np.stack([cv2.resize(x.gray, (96, 96), interpolation=cv2.INTER_AREA) for x in looks])
     bright = stack.mean(0) > 0.25 * np.percentile(stack.mean(0), 95)
     if all(x.mask is not None for x in looks):
@@ -185,31 +179,29 @@ def shading_change(looks: list[Look]) -> float:
 def _surroundings(looks: list[Look], votes: dict, evidence: list[str]) -> None:
     seen = [x for x in looks if x.opaque]
     if not seen:
-        evidence.append(
-            "the surroundings are cut away (alpha channel), so they say nothing about the light"
-        )
+        evidence.append("the background is transparent (alpha channel) and gives no evidence")
         return
     around = np.array([_around(x) for x in seen])  # (N, 3) median colour
     level = np.log2(np.maximum(around.mean(1), 1e-4))
     dark = float((around.mean(1) < DARK).mean())
     if dark > 0.8:
         evidence.append(
-            f"the surroundings are dark in {100 * dark:.0f} % of the photos (below {DARK} of white)"
+            f"the background is dark in {100 * dark:.0f} % of the photos (below {DARK} of white)"
         )
         votes["flash"] += 0.6
         return
     chroma = around / np.maximum(around.sum(1, keepdims=True), 1e-6)
     spread, tint = float(level.std()), float(chroma.std(0).max())
     evidence.append(
-        f"the surroundings vary by {spread:.1f} EV and {tint:.2f} in chromaticity between photos"
+        f"the background varies by {spread:.1f} EV and {tint:.2f} in chromaticity between photos"
     )
     cameras = {x.exif.camera for x in seen if x.exif.camera}
     sizes = {tuple(sorted(x.rgb.shape[:2])) for x in seen}
     if len(cameras) > 2:
-        evidence.append(f"{len(cameras)} different cameras took the photos")
+        evidence.append(f"the photos come from {len(cameras)} different cameras")
         votes["varied"] += 0.7
     if len(sizes) > max(2, len(seen) // 3):
-        evidence.append(f"the photos have {len(sizes)} different shapes")
+        evidence.append(f"the photos have {len(sizes)} different sizes")
         votes["varied"] += 0.4
     if spread > 1.0:
         votes["varied"] += 0.35
@@ -217,17 +209,15 @@ def _surroundings(looks: list[Look], votes: dict, evidence: list[str]) -> None:
         votes["varied"] += 0.35
     if len(seen) > 2:
         overlap = colour_overlap(seen)
-        evidence.append(
-            f"the colours around the object overlap by {100 * overlap:.0f} % from photo to photo"
-        )
+        evidence.append(f"the background colours overlap by {100 * overlap:.0f} % between photos")
         votes["varied"] += 0.5 if overlap < SAME_PLACE else 0.0
     if spread < 0.6 and tint < 0.04:
         votes["fixed"] += 0.3
 
 
 def colour_overlap(looks: list[Look]) -> float:
-    """Median over pairs of photos of the intersection of the chromaticity histograms of their
-    margins: 1 for equal ones."""
+    """Histogram intersection of the chromaticity of the image margins, median over pairs of photos;
+    1 for equal histograms."""
     found = []
     for x in looks:
         h, w = x.rgb.shape[:2]
@@ -263,21 +253,21 @@ def _limb(looks: list[Look], votes: dict, evidence: list[str]) -> None:
     frontal = _frontal(slopes)
     if np.median(slopes[:, 2]) > LIMB and frontal > 0.8:
         evidence.append(
-            f"in {100 * frontal:.0f} % of the photos the object darkens evenly towards its outline: lit from the camera"
+            f"in {100 * frontal:.0f} % of the photos the object darkens evenly towards its outline: light at the camera"
         )
         votes["flash"] += 1.2
 
 
 def _frontal(slopes: np.ndarray) -> float:
-    """Share of the photos in which brightness goes with the normal's component to the camera more
-    than to any side."""
+    """Share of the photos in which brightness depends more on the normal's component towards the
+    camera than on the others."""
     return float((slopes[:, 2] > np.hypot(slopes[:, 0], slopes[:, 1])).mean())
 
 
 def limb_slopes(looks: list[Look]) -> np.ndarray:
-    """(N, 3): how log brightness goes with the normal of the inflated mask (x right, y down, z to
-    the camera), one row per photo with a mask. A lamp at the camera leaves z alone; any other one
-    has a side."""
+    """(N, 3): slope of log brightness over the normal of the inflated mask (x right, y down, z
+    towards the camera), one row per photo with a mask. A lamp at the camera gives a z component
+    only."""
     found = []
     for x in looks:
         inside = None if x.mask is None else x.mask > 0.9
@@ -307,8 +297,8 @@ def _shading(looks: list[Look], sphere: Sphere, votes: dict, evidence: list[str]
         return
     spread, camera, photo, facing = found
     evidence.append(
-        f"places of the object vary by {spread:.2f} (log) between photos; "
-        f"{100 * camera:.0f} % of that goes with the direction to the camera, {100 * photo:.0f} % with the photo"
+        f"surface points vary by {spread:.2f} (log) between photos; the direction to the camera "
+        f"explains {100 * camera:.0f} % of it, the photo {100 * photo:.0f} %"
     )
     if spread > 0.2 and camera > 0.3 and facing > 0.3:
         evidence.append(FOLLOWS)
@@ -320,14 +310,14 @@ def _shading(looks: list[Look], sphere: Sphere, votes: dict, evidence: list[str]
 
 
 def shading_fits(looks: list[Look], sphere: Sphere) -> tuple[float, float, float, float] | None:
-    """How brightness of one place of the object changes from photo to photo, the object taken for
-    its sphere.
+    """Variation of the brightness of surface points between photos; the object sphere stands in for
+    the surface.
 
-    Places are cells of the sphere's directions, which takes texture out. -> (standard deviation of
-    the log brightness about each cell's mean; share of its variance that a linear function of the
-    normal in CAMERA axes explains; share that a linear function of the normal in WORLD axes, with
-    another one for each photo, explains; the first function's slope towards the camera, per unit of
-    the normal's component), or None when too few places are seen often enough.
+    Subtracting the mean of each cell of directions removes texture. Returns (standard deviation of
+    log brightness about the cell means; share of its variance explained by a linear function of the
+    normal in CAMERA axes; share explained by a linear function of the normal in WORLD axes, one per
+    photo; slope of the first function towards the camera, per unit of the normal's component), or
+    None when too few cells are visible in enough photos.
     """
     places, values, camera_normals, world_normals, photos = [], [], [], [], []
     for i, x in enumerate(looks):
@@ -371,8 +361,8 @@ def shading_fits(looks: list[Look], sphere: Sphere) -> tuple[float, float, float
 
 
 def _on_sphere(x: Look, sphere: Sphere, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (N, 3), world, and luminance (N,) of pixels that meet the object sphere, at most
-    SAMPLES of them."""
+    """World normals (N, 3) and luminance (N,) of at most SAMPLES pixels whose rays hit the object
+    sphere."""
     c = x.camera
     rows, columns = (
         np.nonzero(x.mask > 0.9) if x.mask is not None else np.nonzero(np.ones(x.gray.shape, bool))

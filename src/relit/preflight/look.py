@@ -1,5 +1,4 @@
-"""Small copies of some of a capture's photos, decoded once for everything that the preflight
-measures."""
+"""Downscaled copies of some photos of a capture, decoded once for all preflight checks."""
 
 from __future__ import annotations
 
@@ -14,14 +13,14 @@ from relit.images import read_small
 from relit.images.decode import CODED, HEIC, pil
 from relit.scene import Camera, Capture, Photo
 
-MOST = 24  # photos that are decoded
+MOST = 24  # photos to decode
 SIDE = 512  # pixels, longest side
 
 
 @dataclass(frozen=True)
 class Exif:
-    """What the camera wrote. camera: maker and model. exposure: seconds. fnumber, iso: as written.
-    flash: did it fire. None: not said."""
+    """EXIF data. camera: maker and model. exposure: seconds. fnumber, iso: as recorded. flash:
+    whether it fired. None: not recorded."""
 
     camera: str | None = None
     exposure: float | None = None
@@ -31,8 +30,7 @@ class Exif:
 
     @property
     def ev(self) -> float | None:
-        """log2 of the light that the sensor would gather from the same scene, or None when a part
-        of it is not known."""
+        """log2 of exposure * ISO / fnumber^2, or None when one of them is unknown."""
         if not self.exposure or not self.fnumber or not self.iso:
             return None
         return float(np.log2(self.exposure * self.iso / self.fnumber**2))
@@ -41,9 +39,8 @@ class Exif:
 @dataclass(frozen=True)
 class Look:
     """One photo at SIDE pixels or less. rgb: (h, w, 3) linear. mask: (h, w) or None. camera: for
-    this size, or None.
-    sharpness: of the photo before it was shrunk, see `sharpness`. opaque: False where the file has
-    an alpha channel, whose colours outside the object say nothing."""
+    this size, or None. sharpness: of the full-size photo, see `sharpness`. opaque: False where the
+    file has an alpha channel, so that colours outside the object are meaningless."""
 
     name: str
     rgb: np.ndarray
@@ -60,7 +57,7 @@ class Look:
 
 
 def look_at_photos(capture: Capture, most: int = MOST) -> list[Look]:
-    """At most `most` photos, evenly chosen."""
+    """At most `most` photos, evenly spaced in order of name."""
     chosen = np.unique(
         np.linspace(0, len(capture.photos) - 1, min(most, len(capture.photos))).round().astype(int)
     )
@@ -92,8 +89,8 @@ def look(capture: Capture, photo: Photo) -> Look:
 
 
 def sharpness(rgb: np.ndarray, mask: np.ndarray | None) -> float:
-    """Contrast of the finest detail over that of detail four times as coarse, on the object where a
-    mask is known. A blurred photo loses the first and keeps the second, whatever it shows."""
+    """Contrast of the finest detail over that of detail four times as coarse, inside the mask where
+    there is one. Blur reduces the first and keeps the second, independent of content."""
     gray = np.sqrt(np.maximum(rgb @ np.array([0.2126, 0.7152, 0.0722], np.float32), 0))
     inside = (
         np.ones(gray.shape, bool)
@@ -117,7 +114,7 @@ def _opaque(path: Path) -> bool:
 
 
 def read_exif(path: Path) -> Exif:
-    """The camera's record; empty where the file has none or it is damaged."""
+    """EXIF data of a file; empty where it is missing or damaged."""
     if (
         path.suffix.lower() not in CODED | HEIC
         or path.suffix.lower() == ".png"

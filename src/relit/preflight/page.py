@@ -1,4 +1,4 @@
-"""The preflight as one HTML page: self-contained, no script, nothing fetched."""
+"""The preflight as one self-contained HTML page without scripts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 
 from relit.conventions import srgb_from_linear
 from relit.files import disk_errors, write_text
-from relit.preflight.cameras import AGREES, Pair, fundamental, sphere_outline
+from relit.preflight.cameras import AGREES, MatchedPair, fundamental, sphere_outline
 from relit.preflight.look import Look
 from relit.preflight.text import rows_of
 from relit.report.curves import curve
 from relit.scene import Capture
 
 SIDE = 260  # pixels of a thumbnail
-LINES = 10  # matches that are drawn in a pair
+LINES = 10  # matches drawn per pair
 STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:1300px;padding:0 1em;color:#222;background:#fafafa}
 h1{font-size:1.5em;margin-bottom:.1em}h2{font-size:1.1em;margin:1.8em 0 .5em;border-bottom:1px solid #ccc}
@@ -34,16 +34,16 @@ def write_page(
     found: dict,
     capture: Capture,
     looks: list[Look],
-    pairs: list[Pair],
+    pairs: list[MatchedPair],
     plot: str | None,
 ) -> None:
-    """Write the page. found: the answer of `inspect`. plot: the cameras as SVG, or None."""
+    """Write the page. found: result of `inspect_input`. plot: the cameras as SVG, or None."""
     warnings = (
         "".join(
             f"<div class=warn>{escape(w['what'])}<small>{escape(w['fix'])}</small></div>"
             for w in found["warnings"]
         )
-        or "<p>Nothing odd was seen.</p>"
+        or "<p>No warnings.</p>"
     )
     table = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>" for k, v in rows_of(found))
     notes = "".join(f"<li>{escape(n)}</li>" for n in found["notes"])
@@ -54,7 +54,7 @@ def write_page(
     )
     parts = [
         f"<h1>{escape(Path(found['input']).name or found['input'])}</h1><table>{table}</table>",
-        _section("What is odd", warnings),
+        _section("Warnings", warnings),
         _section("Notes of the reader", f"<ul>{notes}</ul>" if notes else ""),
         _section(
             f"Light: {regime['guess']}, confidence {100 * regime['confidence']:.0f} %",
@@ -102,7 +102,7 @@ def _figure(codes: np.ndarray, caption: str) -> str:
 
 
 def overlaid(x: Look, capture: Capture) -> np.ndarray:
-    """(h, w, 3) uint8: the photo, darker and bluish off its mask, with the outline of the object
+    """(h, w, 3) uint8: the photo, darker and blue outside its mask, with the outline of the object
     sphere."""
     s = SIDE / max(x.gray.shape)
     size = (max(1, round(x.gray.shape[1] * s)), max(1, round(x.gray.shape[0] * s)))
@@ -143,15 +143,15 @@ def _thumbnail(x: Look, capture: Capture, row: dict) -> str:
     return _figure(overlaid(x, capture), f"{x.name}: {', '.join(said)}")
 
 
-def _worst(pairs: list[Pair]) -> list[Pair]:
-    """The pair that agrees least, and the one that agrees most."""
+def _worst(pairs: list[MatchedPair]) -> list[MatchedPair]:
+    """The pairs with the lowest and the highest share of matches near their epipolar lines."""
     order = sorted(
         pairs, key=lambda p: float((p.distance < AGREES * max(p.second.gray.shape)).mean())
     )
     return order[:1] + (order[-1:] if len(order) > 1 else [])
 
 
-def _pair(p: Pair) -> str:
+def _pair(p: MatchedPair) -> str:
     a, b = np.ascontiguousarray(_codes(p.first.rgb)), np.ascontiguousarray(_codes(p.second.rgb))
     h = max(a.shape[0], b.shape[0])
     f = fundamental(p.first.camera, p.second.camera)
@@ -176,12 +176,12 @@ def _pair(p: Pair) -> str:
         cv2.circle(b, tuple(round(float(v)) for v in r), 4, colour, 2, cv2.LINE_AA)
     both = np.concatenate([np.pad(x, ((0, h - x.shape[0]), (0, 0), (0, 0))) for x in (a, b)], 1)
     near = float((p.distance < AGREES * max(p.second.gray.shape)).mean())
-    what = f"{p.first.name} and {p.second.name}: {len(p.points)} matches, {100 * near:.0f} % near their lines"
-    return _figure(both, what + "; each ring on the right should lie on its line")
+    what = f"{p.first.name} and {p.second.name}: {len(p.points)} matches, {100 * near:.0f} % near their epipolar lines"
+    return _figure(both, what + "; each ring on the right should lie on its epipolar line")
 
 
 def _drifts(rows: list[dict]) -> str:
-    against = "against the median"
+    against = "relative to the median"
     names = {
         "ev": f"brightness, EV {against}",
         "red": "red over green, log2",

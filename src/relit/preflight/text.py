@@ -1,4 +1,4 @@
-"""The preflight for a reader, line by line."""
+"""The preflight as text, line by line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from relit.log import readable_bytes, readable_seconds
 
 
 def rows_of(found: dict) -> list[tuple[str, str]]:
-    """(name, what was found) of the answer of `inspect`."""
+    """(name, value) rows of a result of `inspect_input`."""
     sphere, masks, cost, regime = (
         found["sphere"],
         found["masks"],
@@ -19,7 +19,7 @@ def rows_of(found: dict) -> list[tuple[str, str]]:
     ball = (
         "centre {:.4g} {:.4g} {:.4g}, radius {:.4g}".format(*sphere["centre"], sphere["radius"])
         if sphere
-        else "not known yet"
+        else "unknown"
     )
     forecast = f"{readable_seconds(cost['seconds'])}, {readable_bytes(cost['memory'])} of memory"
     covered = (
@@ -39,11 +39,11 @@ def rows_of(found: dict) -> list[tuple[str, str]]:
     ]
     if found["epipolar"]:
         e = found["epipolar"]
-        near = "" if e["median"] is None else f", {e['median']:.2f} pixels from them"
+        near = "" if e["median"] is None else f", median distance {e['median']:.2f} pixels"
         rows.append(
             (
                 "epipolar check",
-                f"{100 * e['share']:.0f} % of {e['matches']} matches near their lines{near}",
+                f"{100 * e['share']:.0f} % of {e['matches']} matches near their epipolar lines{near}",
             )
         )
     rows.append(("object sphere", ball))
@@ -59,8 +59,8 @@ def rows_of(found: dict) -> list[tuple[str, str]]:
     tints = f"exposure {drift['exposure_spread']:.2f} EV, tint {drift['tint_spread']:.2f}"
     rows += [
         ("masks", covered + (", ..." if masks and len(masks) > 4 else "")),
-        ("light looks", f"{regime['guess']} (confidence {100 * regime['confidence']:.0f} %)"),
-        ("from photo to photo", f"{tints}, {len(drift['blurred'])} less sharp"),
+        ("light regime", f"{regime['guess']} (confidence {100 * regime['confidence']:.0f} %)"),
+        ("variation", f"{tints}, {len(drift['blurred'])} blurred"),
         ("capture", f"{found['capture']}: {found['light']}"),
         ("stages", ", ".join(found["stages"])),
         ("estimate", f"{forecast} at quality {cost['quality']} on 2 cores"),
@@ -68,8 +68,8 @@ def rows_of(found: dict) -> list[tuple[str, str]]:
     return rows
 
 
-def as_text(found: dict) -> str:
-    """`inspect`'s answer for a reader."""
+def inspection_text(found: dict) -> str:
+    """A result of `inspect_input` as text."""
     lines = [f"{name.ljust(21)}{value}" for name, value in rows_of(found)]
     lines += [f"warning: {w['what']}; {w['fix']}" for w in found["warnings"]]
     return "\n".join(lines + [f"note: {n}" for n in found["notes"]])
