@@ -103,8 +103,8 @@ def test_every_link_leads_somewhere():
     assert not lost
 
 
-def stands(name: str) -> bool:
-    """Whether `tests/x.py`, `fit/x.py`, `fit/x.f` or `fit/x.Class.f` is there."""
+def code_exists(name: str) -> bool:
+    """Whether `tests/x.py`, `fit/x.py`, `fit/x.f` or `fit/x.Class.f` exists."""
     if name.split("/")[0] in ("tests", "tools") or (SOURCE / name).exists():
         return (ROOT / name).exists() or (SOURCE / name).exists()
     module, *attributes = name.split(".")
@@ -125,13 +125,33 @@ def stands(name: str) -> bool:
     return True
 
 
-def test_every_piece_of_code_that_the_equations_and_the_method_name_is_there():
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name != "README.md"], ids=lambda p: p.name)
+def test_code_named_in_a_document_exists(page):
     parts = {p.name for p in SOURCE.iterdir() if p.is_dir()} | {"tests", "tools"}
-    text = "".join(
-        (ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("equations.md", "method.md")
-    )
+    text = page.read_text(encoding="utf-8")
     names = [n for n in re.findall(r"`([\w./]+)`", text) if "/" in n and n.split("/")[0] in parts]
-    assert len(names) > 60 and [n for n in names if not stands(n)] == []
+    least = {"equations.md": 90, "architecture.md": 60, "method.md": 20, "duplicates.md": 20}
+    assert len(names) >= least.get(page.name, 0)
+    files_of_assets = (".json", ".glb")
+    assert [n for n in names if not n.endswith(files_of_assets) and not code_exists(n)] == []
+
+
+def test_modules_of_the_architecture_are_all_packages():
+    """The diagram lists every package of tests/test_imports.py, lower rows below."""
+    tree = ast.parse((ROOT / "tests/test_imports.py").read_text(encoding="utf-8"))
+    table = next(
+        n.value for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "ROWS"
+    )
+    layers = ast.literal_eval(table)
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    diagram = re.search(r"```\n(.*?)```", text, re.S).group(1)
+    rows = [set(line.split()) for line in diagram.splitlines()]
+    for row in layers:
+        for name in set(row) - {"__init__", "__main__"}:
+            assert any(name in words for words in rows), name
+    place = {w: i for i, words in enumerate(rows) for w in words}
+    order = [min(place[n] for n in row if n in place) for row in layers]
+    assert order == sorted(order, reverse=True)
 
 
 def told_flags(verb, kind) -> set[str]:
