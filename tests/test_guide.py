@@ -136,6 +136,18 @@ def test_code_named_in_a_document_exists(page):
     assert [n for n in names if not n.endswith(files_of_assets) and not code_exists(n)] == []
 
 
+def test_lines_of_documents_are_at_most_100_columns():
+    pages = {*PAGES, *ROOT.glob("*.md"), *(ROOT / "docs/research").glob("*.md")}
+    pages -= {ROOT / "docs/figures.md"}
+    wide = [
+        f"{page.relative_to(ROOT)}:{number}"
+        for page in sorted(pages)
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        if len(line) > 100
+    ]
+    assert wide == []
+
+
 def test_modules_of_the_architecture_are_all_packages():
     """The diagram lists every package of tests/test_imports.py, lower rows below."""
     tree = ast.parse((ROOT / "tests/test_imports.py").read_text(encoding="utf-8"))
