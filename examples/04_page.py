@@ -1,6 +1,6 @@
 """One HTML file to send to somebody without Python or Blender:
 
-    python examples/04_page.py RUN FILE.html
+python examples/04_page.py RUN FILE.html
 """
 
 import sys

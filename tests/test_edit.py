@@ -117,10 +117,10 @@ def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):
         insert(folder, folder, tmp_path / "x.png", photo=photo, at=(500, 5))
     with pytest.raises(UserError, match="does not meet the ground"):
         look_up = camera.with_pose(look_at([0, 1, 5.0], (0, 3, 0)))
-        from relit.edit import standing
+        from relit.edit import mesh_on_ground
 
         asset = load_asset(folder)
-        standing(asset.mesh, asset, look_up, (36, 5), 1.0, 0.0)
+        mesh_on_ground(asset.mesh, asset, look_up, (36, 5), 1.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", ["collection", "flash"])

@@ -29,7 +29,7 @@ from relit.files import load_arrays
 from relit.geometry.se3 import look_at
 from relit.images import read_header, read_image, read_small, write_linear
 from relit.images.opencv import decode_bytes, decode_file
-from relit.lighting.spherical_gaussians import read_json as read_gaussians
+from relit.lighting.spherical_gaussians import read_lobes as read_lobes
 from relit.masks.files import read_mask
 from relit.scene import Asset, Camera, Flash, Ground, Instance
 from relit.synthesize.procedural import pawn
@@ -215,7 +215,7 @@ def test_senseless_values_in_gaussians(tmp_path):
     @given(places, st.sampled_from(SENSELESS))
     def run(where, new):
         path.write_text(json.dumps(replaced(good, where, new)))
-        answers(read_gaussians, path)
+        answers(read_lobes, path)
 
     run()
 
@@ -495,7 +495,7 @@ def test_the_valid_files_are_read(valid, tmp_path):
     (tmp_path / "light.json").write_text(
         json.dumps({"lobes": [{"axis": [0, 1, 0], "sharpness": 3.0, "amplitude": [1, 1, 1]}]})
     )
-    assert len(read_gaussians(tmp_path / "light.json").sharpness) == 1
+    assert len(read_lobes(tmp_path / "light.json").sharpness) == 1
     (tmp_path / "transforms.json").write_text(json.dumps(frames(tmp_path)))
     assert len(open_capture(tmp_path, masks="none").photos) == 4
     (tmp_path / "a.obj").write_text(

@@ -10,8 +10,8 @@ from relit.conventions import similarity
 from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals
 from relit.images import read_image, write_linear
-from relit.lighting.spherical_gaussians import SphericalGaussians, write_json
-from relit.relight import orbit, relight, seen_from
+from relit.lighting.spherical_gaussians import SphericalGaussians, write_lobes
+from relit.relight import orbit, orbit_camera, relight
 from relit.scene import Asset, Camera, Material, Mesh
 
 TURN = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)  # world +Z is the asset's up
@@ -92,7 +92,7 @@ def test_rotation_turns_the_light_about_the_objects_up(run, tmp_path):
 
 def test_spherical_gaussians_as_light(run, tmp_path):
     sg = SphericalGaussians(np.array([[0, 1.0, 0]]), np.array([30.0]), np.array([[10.0, 10, 10]]))
-    write_json(tmp_path / "sky.json", sg)
+    write_lobes(tmp_path / "sky.json", sg)
     top, bottom, _, _ = halves(relight(run, tmp_path / "sky.json", tmp_path / "out", spp=8)[0])
     assert top > 5 * bottom
 
@@ -114,7 +114,7 @@ def test_turntable_holds_the_object_in_view(asset):
 def test_the_object_from_above_and_from_below(asset):
     middle, up = np.array([5.0, 6, 7]), np.array([0, 0, 1.0])  # the asset's up is the world's +Z
     for elevation, sign in ((90, 1), (-90, -1)):
-        camera = seen_from(asset, 0, elevation, 64)
+        camera = orbit_camera(asset, 0, elevation, 64)
         away = camera.centre - middle
         np.testing.assert_allclose(away / np.linalg.norm(away), sign * up, atol=1e-6)
         xy = camera.project(asset.mesh.vertices @ (0.1 * TURN).T + middle)

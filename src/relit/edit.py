@@ -199,7 +199,7 @@ def insert(
             f"--at {x:g},{y:g} lies outside the photo of {camera.width} x {camera.height} pixels",
             code=EXIT_USAGE,
         )
-    placed = standing(mesh, asset, camera, at, size, turn)
+    placed = mesh_on_ground(mesh, asset, camera, at, size, turn)
     poses = [i.world_from_object for i in asset.instances if i.registered]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
     before = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
@@ -214,7 +214,7 @@ def insert(
     return out
 
 
-def standing(mesh: Mesh, asset: Asset, camera: Camera, at, size: float, turn: float) -> Mesh:
+def mesh_on_ground(mesh: Mesh, asset: Asset, camera: Camera, at, size: float, turn: float) -> Mesh:
     """The mesh in the world: its lowest point on the ground where the ray through pixel `at` meets
     it, +Y along the ground's normal."""
     from relit.geometry.se3 import exp_so3, rotation_from

@@ -56,7 +56,7 @@ def reconstruct(
 
     job, from_file = plan_job(flags, config)
     capture_kind(job.capture)  # a kind that is not there is refused before anything is read
-    apart(Path(input), Path(out))
+    check_folders_apart(Path(input), Path(out))
     chosen = use_device(device)
     capture, kind = open_as(Path(input), job)
     recipe = recipe_of(kind)
@@ -115,7 +115,7 @@ def unchanged(run: Run, capture: Capture) -> None:
         )
 
 
-def apart(input: Path, out: Path) -> None:
+def check_folders_apart(input: Path, out: Path) -> None:
     """Raises UserError when the run folder would lie in the input or hold it: the run's pictures
     would be taken for photos."""
     a, b = input.resolve(), out.resolve()

@@ -15,7 +15,7 @@ from relit.asset.asset import find_asset, load_asset, read_cameras
 from relit.conventions import move_points, move_pose, rotate_environment, srgb_from_linear
 from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError
 from relit.images import read_image, write_linear, write_srgb
-from relit.lighting.spherical_gaussians import environment_of, read_json
+from relit.lighting.spherical_gaussians import environment_of, read_lobes
 from relit.reference.mitsuba_scene import render
 from relit.reference.photographed import lit_scene
 from relit.scene import Asset, Camera, Material
@@ -97,7 +97,7 @@ def read_light(path: Path) -> np.ndarray:
     UserError."""
     suffix = path.suffix.lower()
     if suffix == ".json":
-        return environment_of(read_json(path))
+        return environment_of(read_lobes(path))
     if suffix not in (".hdr", ".exr"):
         fix = f"give a lat-long .hdr or .exr, or a .json of spherical Gaussians: {path}"
         raise UserError(f"'{suffix}' is not a light", "a light needs linear radiance", fix)
@@ -146,11 +146,12 @@ def orbit(asset: Asset, count: int, size: int = ORBIT_SIZE) -> list[tuple[str, C
     """A turntable: `count` square views round the object's up that hold its bounding sphere, in the
     world frame."""
     return [
-        (f"{i:04d}", seen_from(asset, 360 * i / count, ORBIT_ELEVATION, size)) for i in range(count)
+        (f"{i:04d}", orbit_camera(asset, 360 * i / count, ORBIT_ELEVATION, size))
+        for i in range(count)
     ]
 
 
-def seen_from(asset: Asset, azimuth: float, elevation: float, size: int = ORBIT_SIZE) -> Camera:
+def orbit_camera(asset: Asset, azimuth: float, elevation: float, size: int = ORBIT_SIZE) -> Camera:
     """A square view that holds the object's bounding sphere, in the world frame. azimuth: degrees
     round the object's up, from +Z towards +X. elevation: degrees above its horizon, -90 to 90."""
     low, high = asset.mesh.vertices.min(0), asset.mesh.vertices.max(0)

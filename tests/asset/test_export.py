@@ -11,7 +11,7 @@ from relit.asset.export import export_asset, write_mitsuba
 from relit.asset.gltf import read_asset_file
 from relit.conventions import environment_directions, environment_solid_angles, rotate_environment
 from relit.errors import UserError
-from relit.lighting.spherical_gaussians import environment_of, read_json
+from relit.lighting.spherical_gaussians import environment_of, read_lobes
 from relit.reference.mitsuba_scene import build_scene, render
 from relit.scene import Flash
 
@@ -47,7 +47,7 @@ def test_gaussians_light_the_object_from_where_the_environment_did(asset, tmp_pa
         "gaussians",
         tmp_path / "light.json",
     )
-    lobes = read_json(tmp_path / "light.json")
+    lobes = read_lobes(tmp_path / "light.json")
     assert len(lobes.sharpness) == 128
     found = rotate_environment(environment_of(lobes, 32, 64), asset.world_from_asset)
     assert not np.allclose(

@@ -12,7 +12,7 @@ import trimesh
 from relit.benchmark import SUITES, Item, Suite, run_suite, runner
 from relit.benchmark.cost import timed
 from relit.benchmark.results import means, verdict
-from relit.benchmark.suites import named
+from relit.benchmark.suites import function_at
 from relit.errors import EXIT_FAILED, UserError
 from relit.images import write_linear
 from relit.scene import Asset, Material, Mesh
@@ -74,11 +74,11 @@ def test_a_suite_names_what_there_is(name):
 
     suite = SUITES[name]
     assert suite.kind in RECIPES and suite.items
-    synthesize, evaluate = named(suite.synthesize), named(suite.evaluate)
+    synthesize, evaluate = function_at(suite.synthesize), function_at(suite.evaluate)
     assert (
         callable(synthesize)
         and callable(evaluate)
-        and callable(named(suite.synthesize.rpartition(".")[0] + ".settings_of"))
+        and callable(function_at(suite.synthesize.rpartition(".")[0] + ".settings_of"))
     )
     keywords = synthesize.__kwdefaults__
     for options in (suite.options, *(item.options for item in suite.items)):

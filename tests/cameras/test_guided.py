@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from relit.cameras.guided import (
-    adjusted,
-    agreeing,
+    bundle_adjusted,
+    consistent_matches,
     guided,
     guided_links,
     midpoints,
@@ -96,7 +96,7 @@ def test_guided_matches_are_right_and_adjustment_lowers_the_error():
         p, q = features[i].points[link.a], features[j].points[link.b]
         assert np.median(midpoints(p, q, true[[i, j]], (CAMERA, CAMERA))[1]) < 0.005
     before = np.median(pair_errors(wrong, true))
-    moved, counts, (start, end) = adjusted(features, links, wrong, cameras)
+    moved, counts, (start, end) = bundle_adjusted(features, links, wrong, cameras)
     assert end < 0.5 * start and counts.sum() > 40
     linked = sorted({k for pair in links for k in pair})
     assert np.median(pair_errors(moved[linked], true[linked])) < 0.7 * before
@@ -112,7 +112,7 @@ def test_matches_that_the_poses_forbid_are_left_out():
     links = {
         (0, 1): Link(np.arange(n), np.arange(n)[::-1].copy(), 0.0)
     }  # keypoints paired at random
-    kept = agreeing(features, links, true, [CAMERA] * 4)
+    kept = consistent_matches(features, links, true, [CAMERA] * 4)
     assert not kept or len(kept[0, 1].a) < 0.5 * n
     bare = [Features(f.points, np.zeros((0, 0, 0), np.float32)) for f in features]
     same, count = guided(bare, {}, true, [CAMERA] * 4, 2.0)

@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.cameras.matcher import keypoints, link_by_matcher, load_matcher, matches_at, turned
+from relit.cameras.matcher import (
+    keypoints,
+    link_by_matcher,
+    load_matcher,
+    matches_at,
+    rotated_picture,
+)
 from relit.cameras.rotation_sweep import Features
 from relit.errors import UserError
 from relit.geometry.se3 import exp_so3, rotation_angle
@@ -32,7 +38,7 @@ def test_points_of_the_turned_picture_are_carried_back():
         picture[y, x, c] = 255
     picture = cv2.GaussianBlur(picture, (0, 0), 1.5)
     for degrees in (0.0, 24.0, 100.0, 215.0):
-        assert turned(picture, degrees)[0].shape[0] >= 50 or degrees == 0
+        assert rotated_picture(picture, degrees)[0].shape[0] >= 50 or degrees == 0
         p, q = matches_at(corners, picture, picture, degrees)
         assert np.abs(p - q).max() < 1.5 and np.abs(p - where - 0.5).max() < 1.5
 

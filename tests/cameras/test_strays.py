@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from relit.cameras.strays import LEAST_POINTS, shown, stray_photos
+from relit.cameras.strays import LEAST_POINTS, expected_points, stray_photos
 from relit.conventions import similarity
 from relit.fit.registration.register import directions_around
 from relit.geometry.se3 import exp_so3, look_at
@@ -106,7 +106,7 @@ def test_points_behind_or_beside_the_picture_are_not_shown(seen):
     mask[:, : SIDE // 4 - 8] = 0  # the object goes on beyond the border
     x, ahead = c.world_from_camera[:3, 0], c.world_from_camera[:3, 2]
     points = c.centre + np.array([2 * ahead, -2 * ahead, 2 * ahead + 5 * x, 2 * ahead - 0.3 * x])
-    inside, held = shown(c, mask, points)
+    inside, held = expected_points(c, mask, points)
     assert inside.tolist() == [True, False, False, True] and held.tolist() == [
         True,
         False,
@@ -114,6 +114,6 @@ def test_points_behind_or_beside_the_picture_are_not_shown(seen):
         False,
     ]
     mask[[0, -1]], mask[:, [0, -1]] = 0, 0
-    assert shown(c, mask, points)[
+    assert expected_points(c, mask, points)[
         0
     ].all()  # all of it lies in the frame: where it does not, something is wrong

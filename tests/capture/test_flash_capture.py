@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from relit.capture.open import open_capture
-from relit.capture.readers.iron import read_light
+from relit.capture.readers.iron import read_flash_light
 from relit.errors import UserError
 from relit.synthesize.flash import OFFSET, synthesize_flash
 
@@ -38,7 +38,7 @@ def test_reader_and_synthesizer_agree(made):
     truth = json.loads((made / "truth" / "truth.json").read_text())
     assert (capture.format, capture.kind) == ("iron", "flash")
     assert len(capture.photos) == 4 and len(capture.held_out) == 1
-    intensity, offset = read_light(made)
+    intensity, offset = read_flash_light(made)
     assert intensity == pytest.approx(truth["flash"]["intensity"][0], rel=1e-6)
     np.testing.assert_allclose(offset, OFFSET, atol=1e-8)
     for photo in (
@@ -123,20 +123,20 @@ def test_offsets_of_pir_and_of_our_own(made, tmp_path):
     assert "OpenCV" in (made / "light_offset.txt").read_text().splitlines()[0]
     (tmp_path / "test").mkdir()
     (tmp_path / "test" / "light_offset.txt").write_text("0.2 0.1 0.05\n")
-    np.testing.assert_allclose(read_light(tmp_path)[1], [-0.2, -0.1, 0.05])
+    np.testing.assert_allclose(read_flash_light(tmp_path)[1], [-0.2, -0.1, 0.05])
     (tmp_path / "truth").mkdir()
     (tmp_path / "truth" / "truth.json").write_text("{}")
-    np.testing.assert_allclose(read_light(tmp_path)[1], [0.2, 0.1, 0.05])
+    np.testing.assert_allclose(read_flash_light(tmp_path)[1], [0.2, 0.1, 0.05])
     (tmp_path / "truth" / "truth.json").unlink()
     (tmp_path / "test" / "light_offset.txt").write_text((made / "light_offset.txt").read_text())
-    np.testing.assert_allclose(read_light(tmp_path)[1], OFFSET, atol=1e-8)
+    np.testing.assert_allclose(read_flash_light(tmp_path)[1], OFFSET, atol=1e-8)
 
 
 def test_light_files(tmp_path):
-    assert read_light(tmp_path) == (None, None)
+    assert read_flash_light(tmp_path) == (None, None)
     (tmp_path / "light_offset.txt").write_text("0.1 0.2")
     with pytest.raises(UserError, match=r"light_offset\.txt does not hold 3 numbers"):
-        read_light(tmp_path)
+        read_flash_light(tmp_path)
 
 
 def test_missing_light_is_told_when_it_is_needed(made, tmp_path):

@@ -25,7 +25,7 @@ def holds(sphere, points, low, high):
 
 
 def views(cameras):
-    return [s.View(c, mask=camera_ring.picture(c)[1]) for c in cameras]
+    return [s.SphereView(c, mask=camera_ring.picture(c)[1]) for c in cameras]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -36,7 +36,9 @@ def test_from_masks_in_any_frame(seed):
     )
     cameras = camera_ring.ring(8)
     moved = [
-        s.View(v.camera.with_pose(move_pose(b_from_a, v.camera.world_from_camera)), mask=v.mask)
+        s.SphereView(
+            v.camera.with_pose(move_pose(b_from_a, v.camera.world_from_camera)), mask=v.mask
+        )
         for v in views(cameras)
     ]
     sphere, source = s.find_sphere(moved)
@@ -53,14 +55,14 @@ def test_from_masks_of_a_lens_and_of_pictures_that_cut_the_object():
     lens = BrownLens((0.0, 0.0, 0.0, 0.0))
     plain = s.sphere_from_masks(views(camera_ring.ring(8)))
     through = s.sphere_from_masks(
-        [s.View(v.camera, lens, v.mask) for v in views(camera_ring.ring(8))]
+        [s.SphereView(v.camera, lens, v.mask) for v in views(camera_ring.ring(8))]
     )
     np.testing.assert_allclose(through.centre, plain.centre)
 
 
 def test_one_bad_mask_of_many_does_not_matter():
     good = views(camera_ring.ring(24))
-    bad = [s.View(good[0].camera, mask=np.roll(good[0].mask, 30, axis=1)), *good[1:]]
+    bad = [s.SphereView(good[0].camera, mask=np.roll(good[0].mask, 30, axis=1)), *good[1:]]
     holds(s.sphere_from_masks(bad), object_points(), 0.55, 1.0)
 
 
@@ -75,7 +77,7 @@ def test_the_masks_that_miss_the_object_are_named():
     wrong = np.zeros_like(good[3].mask)
     wrong[:6, :6] = 1
     named = [
-        s.View(v.camera, mask=wrong if i in (3, 7) else v.mask, name=f"p{i}.png")
+        s.SphereView(v.camera, mask=wrong if i in (3, 7) else v.mask, name=f"p{i}.png")
         for i, v in enumerate(good)
     ]
     with pytest.raises(UserError, match="no place in common") as caught:
@@ -86,12 +88,12 @@ def test_the_masks_that_miss_the_object_are_named():
 def replace_mask(view, i):
     mask = np.zeros_like(view.mask)
     mask[(4, 48)[i % 2] :, :][:6, 4 + 11 * i : 10 + 11 * i] = 1
-    return s.View(view.camera, mask=mask)
+    return s.SphereView(view.camera, mask=mask)
 
 
 def test_from_points_of_a_turntable():
     points = np.concatenate([object_points(), [[40.0, 0, 0]]])
-    sphere, source = s.find_sphere([s.View(c) for c in camera_ring.ring()], points)
+    sphere, source = s.find_sphere([s.SphereView(c) for c in camera_ring.ring()], points)
     assert source == "the sparse points"
     holds(sphere, points[:-1], 0.8, 0.95)
 
@@ -100,7 +102,7 @@ def test_from_rays_with_a_background():
     rng = np.random.default_rng(0)
     room = rng.uniform(-20, 20, (3000, 3))
     cameras = camera_ring.ring(10, focal=100.0)
-    sphere, source = s.find_sphere([s.View(c) for c in cameras], room)
+    sphere, source = s.find_sphere([s.SphereView(c) for c in cameras], room)
     assert source == "the cameras' viewing directions"
     np.testing.assert_allclose(sphere.centre, 0, atol=0.15)
     assert 0.8 < sphere.radius < 1.6

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from relit import images
 from relit.capture import open as opening
-from relit.capture.frames import read_json
+from relit.capture.frames import parse_json_file
 from relit.capture.open import open_capture
 from relit.capture.readers.middlebury import parse
 from relit.cli import main as cli
@@ -361,6 +361,6 @@ def test_any_parameter_file_is_read_or_refused(text):
 def test_any_bytes_as_json_are_read_or_refused(tmp_path, data):
     (tmp_path / "x.json").write_bytes(data)
     try:
-        assert isinstance(read_json(tmp_path / "x.json"), dict)
+        assert isinstance(parse_json_file(tmp_path / "x.json"), dict)
     except UserError:
         pass

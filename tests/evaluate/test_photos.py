@@ -179,11 +179,11 @@ def test_the_sphere_and_the_directions_of_a_camera():
     np.testing.assert_allclose(
         camera.project(ends)[..., 0], np.arange(40) + 0.5 + np.zeros((30, 1)), atol=1e-9
     )
-    hit = photos.meets(camera, d, Sphere(np.zeros(3), 0.5))
+    hit = photos.meets_sphere(camera, d, Sphere(np.zeros(3), 0.5))
     radius = 60 * np.tan(np.arcsin(0.5 / 4))
     u, v = np.meshgrid(np.arange(40) + 0.5 - 20, np.arange(30) + 0.5 - 15)
     np.testing.assert_array_equal(hit, np.hypot(u, v) < radius)
-    assert not photos.meets(
+    assert not photos.meets_sphere(
         camera, d, Sphere(np.array([0, 0, 9.0]), 0.5)
     ).any()  # behind the camera
 

@@ -13,7 +13,7 @@ from relit.evaluate import metrics
 from relit.evaluate import multiview as protocols
 from relit.evaluate.alignment import aligned
 from relit.evaluate.definitions import DEFINITIONS
-from relit.evaluate.results import table
+from relit.evaluate.results import figures_table
 from relit.evaluate.surfaces import chamfer_figures, visible
 from relit.evaluate.truth import camera_key, load_truth
 from relit.images import write_linear, write_srgb
@@ -211,7 +211,7 @@ def test_the_table_shows_every_figure(truth, itself):
 
     result = {"metrics": {"novel_psnr": {"value": 33.333, "unit": "dB", "definition": "as said"}}}
     text = StringIO()
-    Console(file=text, width=120).print(table(result, "A title"))
+    Console(file=text, width=120).print(figures_table(result, "A title"))
     assert all(
         word in text.getvalue() for word in ("A title", "novel_psnr", "33.33", "dB", "as said")
     )

@@ -7,7 +7,7 @@ import pytest
 
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.revolution_axis import Axis
-from relit.geometry.rounded import centred, rounded
+from relit.geometry.rounded import refine_axis, rounded
 from relit.geometry.sdf import node_positions, redistance
 
 N = 64
@@ -92,7 +92,7 @@ def test_an_axis_that_is_off_is_found():
     mesh = lathe(lambda turn, height: 0.004 * np.sin(9 * turn + 7 * height))
     found = wrong
     for _ in range(3):
-        found = centred(mesh, found, STEP)
+        found = refine_axis(mesh, found, STEP)
     assert np.degrees(np.arccos(found.direction @ AXIS.direction)) < 0.1
     between = found.point - AXIS.point
     assert np.linalg.norm(between - between @ AXIS.direction * AXIS.direction) < 0.03 * STEP

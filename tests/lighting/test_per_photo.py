@@ -5,10 +5,10 @@ mi = pytest.importorskip("mitsuba")
 
 
 def lights(count=3):
-    from relit.lighting.per_photo import PhotoLights, light_prior, log_lights
+    from relit.lighting.per_photo import PhotoLights, load_light_prior, log_lights
 
     rng = np.random.default_rng(0)
-    k = light_prior()[1].shape[0]
+    k = load_light_prior()[1].shape[0]
     return PhotoLights(
         mi.Float(
             np.exp(
@@ -67,9 +67,9 @@ def test_sampling_agrees_with_its_density():
 
 
 def test_the_prior_knows_what_is_up():
-    from relit.lighting.per_photo import COLUMNS, ROWS, light_prior
+    from relit.lighting.per_photo import COLUMNS, ROWS, load_light_prior
 
-    mean, basis = light_prior()
+    mean, basis = load_light_prior()
     sky, ground = (
         mean.reshape(ROWS, COLUMNS, 3)[: ROWS // 2].mean(),
         mean.reshape(ROWS, COLUMNS, 3)[ROWS // 2 :].mean(),
@@ -86,9 +86,9 @@ def test_the_shipped_light_comes_from_above():
     """Irradiance of the middle light on what faces up, aside and down: a ground of ordinary
     reflectance sends back a fifth to a half."""
     from relit.conventions import environment_directions, environment_solid_angles
-    from relit.lighting.per_photo import COLUMNS, ROWS, light_prior
+    from relit.lighting.per_photo import COLUMNS, ROWS, load_light_prior
 
-    mean, basis = light_prior()
+    mean, basis = load_light_prior()
     radiance = np.exp(mean).reshape(-1, 3)
     directions = environment_directions(ROWS, COLUMNS).reshape(-1, 3)
     angles = environment_solid_angles(ROWS, COLUMNS).ravel()

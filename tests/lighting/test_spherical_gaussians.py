@@ -11,12 +11,12 @@ from relit.lighting.spherical_gaussians import (
     SphericalGaussians,
     energy,
     environment_of,
-    evaluate,
     fibonacci,
     fit_spherical_gaussians,
-    read_json,
+    gaussian_radiance,
+    read_lobes,
     rotate,
-    write_json,
+    write_lobes,
 )
 
 
@@ -40,8 +40,8 @@ def irradiance(image):
 
 def test_one_lobe_is_the_formula():
     sg = SphericalGaussians(np.array([[0, 1.0, 0]]), np.array([3.0]), np.array([[2.0, 1, 0.5]]))
-    assert np.allclose(evaluate(sg, [0, 1, 0]), [2, 1, 0.5])
-    assert np.allclose(evaluate(sg, [[[1, 0, 0]]]), np.exp(-3) * np.array([2, 1, 0.5]))
+    assert np.allclose(gaussian_radiance(sg, [0, 1, 0]), [2, 1, 0.5])
+    assert np.allclose(gaussian_radiance(sg, [[[1, 0, 0]]]), np.exp(-3) * np.array([2, 1, 0.5]))
 
 
 @pytest.mark.parametrize("sharpness", [0.5, 20.0, 3000.0])
@@ -93,13 +93,15 @@ def test_rotation_turns_the_light():
     sg = some()
     turn = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], float)
     d = fibonacci(50)
-    assert np.allclose(evaluate(rotate(sg, 2.5 * turn), d @ turn.T), evaluate(sg, d))
+    assert np.allclose(
+        gaussian_radiance(rotate(sg, 2.5 * turn), d @ turn.T), gaussian_radiance(sg, d)
+    )
 
 
 def test_file_round_trip(tmp_path):
     sg = some()
-    write_json(tmp_path / "light.json", sg)
-    got = read_json(tmp_path / "light.json")
+    write_lobes(tmp_path / "light.json", sg)
+    got = read_lobes(tmp_path / "light.json")
     assert np.allclose(got.axis, sg.axis)
     assert np.allclose(got.sharpness, sg.sharpness)
     assert np.allclose(got.amplitude, sg.amplitude)
@@ -122,7 +124,7 @@ def test_file_round_trip(tmp_path):
 def test_bad_files_get_an_answer(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(UserError, match="no spherical Gaussians"):
-        read_json(tmp_path / "a.json")
+        read_lobes(tmp_path / "a.json")
 
 
 def test_bad_maps_get_an_answer():

@@ -59,7 +59,7 @@ def test_equals_the_twin(seed):
         for _ in range(2)
     )
     m = brdf.Surface(mi.Color3f(*base.T), mi.Float(rough), mi.Float(metal), mi.Float(0.05))
-    got = np.array(brdf.evaluate(m, vectors(n), vectors(v), vectors(l))).T
+    got = np.array(brdf.evaluate_brdf(m, vectors(n), vectors(v), vectors(l))).T
     want = twin.evaluate(base, rough, metal, 0.05, n, v, l, lobe_energy)
     assert np.median(want) > 0.05
     assert np.abs(got / np.maximum(want, 1e-3) - np.where(want > 1e-3, 1, got / 1e-3)).max() < 0.02
@@ -82,7 +82,7 @@ def test_white_furnace(roughness, cos, too_much):
     l = hemisphere(400)
     for metallic, low, high in [(1.0, 0.985, 1.01), (0.0, 0.96, 1 + too_much)]:
         m = surface((1, 1, 1), roughness, metallic)
-        f = brdf.evaluate(m, mi.Normal3f(0, 0, 1), vectors(viewer(cos)), vectors(l))
+        f = brdf.evaluate_brdf(m, mi.Normal3f(0, 0, 1), vectors(viewer(cos)), vectors(l))
         assert low < np.array(f)[0].mean() * 2 * np.pi < high
 
 
@@ -98,7 +98,9 @@ def test_reciprocity_of_the_single_scattering_lobe():
     def lobe(a, b):
         energy = lobe_energy(a[:, 2], np.full(len(a), 0.5, np.float32))[:, None]
         compensation = 1 + np.array([0.9, 0.5, 0.2]) * (1 / energy - 1)
-        return np.array(brdf.evaluate(m, n, vectors(a), vectors(b))).T / compensation / b[:, 2:]
+        return (
+            np.array(brdf.evaluate_brdf(m, n, vectors(a), vectors(b))).T / compensation / b[:, 2:]
+        )
 
     assert np.allclose(lobe(v, l), lobe(l, v), rtol=1e-3, atol=1e-5)
 
@@ -107,9 +109,9 @@ def test_reciprocity_of_the_single_scattering_lobe():
 @pytest.mark.parametrize("cos", [0.15, 0.8])
 def test_density_integrates_to_the_part_above_the_horizon(base, roughness, metallic, cos):
     m, n, v = surface(base, roughness, metallic), mi.Normal3f(0, 0, 1), vectors(viewer(cos))
-    total = np.array(brdf.pdf(m, n, v, vectors(hemisphere(1200)))).mean() * 2 * np.pi
+    total = np.array(brdf.brdf_pdf(m, n, v, vectors(hemisphere(1200)))).mean() * 2 * np.pi
     u = np.random.default_rng(0).random((3, 100_000)).astype(np.float32)
-    l = brdf.sample(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
+    l = brdf.sample_brdf(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
     assert total == pytest.approx(np.mean(np.array(l.z) > 0), abs=0.01)
 
 
@@ -123,7 +125,9 @@ def test_samples_follow_the_density(base, roughness, metallic, cos):
     v = frame.to_world(vectors(viewer(cos)))
     count, rows, columns, fine = 60_000, 12, 24, 24
     u = np.random.default_rng(1).random((3, count)).astype(np.float32)
-    l = np.array(frame.to_local(brdf.sample(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2])))).T
+    l = np.array(
+        frame.to_local(brdf.sample_brdf(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2])))
+    ).T
     phi = np.mod(np.arctan2(l[:, 1], l[:, 0]) / (2 * np.pi), 1)
     seen, _, _ = np.histogram2d(l[:, 2], phi, bins=(rows, columns), range=((0, 1), (0, 1)))
     z, p = np.meshgrid(
@@ -137,7 +141,7 @@ def test_samples_follow_the_density(base, roughness, metallic, cos):
             np.stack([s * np.cos(2 * np.pi * p), s * np.sin(2 * np.pi * p), z], -1).reshape(-1, 3)
         )
     )
-    density = np.array(brdf.pdf(m, n, v, grid)).reshape(rows, fine, columns, fine).mean((1, 3))
+    density = np.array(brdf.brdf_pdf(m, n, v, grid)).reshape(rows, fine, columns, fine).mean((1, 3))
     expected = density * count * 2 * np.pi / (rows * columns)
     ok = expected > 5
     chi2, dof = ((seen - expected)[ok] ** 2 / expected[ok]).sum(), ok.sum()
@@ -151,15 +155,15 @@ def test_sampling_is_unbiased(cos, roughness):
     normal looks away from the viewer."""
     m, n, v = surface((0.8, 0.4, 0.1), roughness, 0.3), mi.Normal3f(0, 0, 1), vectors(viewer(cos))
     u = np.random.default_rng(2).random((3, 400_000)).astype(np.float32)
-    l = brdf.sample(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
-    p = np.array(brdf.pdf(m, n, v, l))
+    l = brdf.sample_brdf(m, n, v, mi.Float(u[0]), mi.Point2f(u[1], u[2]))
+    p = np.array(brdf.brdf_pdf(m, n, v, l))
     got = np.where(p > 0, np.array(l.z) / np.maximum(p, 1e-9), 0)
     assert got.mean() == pytest.approx(np.pi, abs=max(0.02, 4 * got.std() / np.sqrt(len(p))))
     assert got.std() < 20
 
 
 def test_the_viewer_behind_an_interpolated_normal_is_not_black():
-    value = brdf.evaluate(
+    value = brdf.evaluate_brdf(
         surface((0.8, 0.8, 0.8), 0.5, 0.0),
         mi.Normal3f(0, 0, 1),
         vectors(viewer(-0.1)),
@@ -191,7 +195,7 @@ def test_gradients_agree_with_finite_differences(base, roughness, metallic):
     original, brdf.lobe_albedo = brdf.lobe_albedo, lambda c, r: mi.Float(0.5)
     try:
         m = brdf.Surface(mi.Color3f(*x[:3]), x[3], x[4], mi.Float(0.04))
-        f = brdf.evaluate(m, mi.Vector3f(*x[5:8]), mi.Vector3f(*x[8:11]), mi.Vector3f(*x[11:]))
+        f = brdf.evaluate_brdf(m, mi.Vector3f(*x[5:8]), mi.Vector3f(*x[8:11]), mi.Vector3f(*x[11:]))
     finally:
         brdf.lobe_albedo = original
     dr.backward(0.5 * f.x + f.y + 2 * f.z)
@@ -233,7 +237,7 @@ def test_close_to_mitsubas_principled(base, roughness, metallic):
     want = np.array(other.eval(mi.BSDFContext(), si, l)).sum(0)
     m = surface(base, roughness, metallic)
     energy = 1 / lobe_energy(np.array(v)[2], np.full(int(ok.sum()), roughness, np.float32)) - 1
-    got = np.array(brdf.evaluate(m, mi.Normal3f(0, 0, 1), v, l)).sum(0)
+    got = np.array(brdf.evaluate_brdf(m, mi.Normal3f(0, 0, 1), v, l)).sum(0)
     tint = metallic * np.mean(base) + (1 - metallic) * 0.04
     error = got / (1 + metallic * tint * energy) / want - 1
     assert np.abs(error).mean() < 0.06

@@ -29,11 +29,11 @@ def albedos(kd, base, ks, alpha, degrees):
     given base colour."""
     n, l = mi.Vector3f(0, 0, 1), hemisphere()
     v = mi.Vector3f(float(np.sin(np.radians(degrees))), 0, float(np.cos(np.radians(degrees))))
-    plastic = rough_plastic.evaluate(
+    plastic = rough_plastic.evaluate_plastic(
         Plastic(mi.Color3f(kd), mi.Float(ks), mi.Float(alpha)), Coat(IOR), n, v, l
     )
     f0 = mi.Color3f(f0_from_ior(IOR) * ks)
-    gltf = brdf.evaluate(
+    gltf = brdf.evaluate_brdf(
         brdf.Surface(mi.Color3f(base), mi.Float(np.sqrt(alpha)), mi.Float(0), f0), n, v, l
     )
     return [2 * np.pi * float(dr.mean(c.x)[0]) for c in (plastic, gltf)]
@@ -68,7 +68,9 @@ def test_the_factor_is_the_least_squares_one(alpha, ks):
     cos_v, cos_l = (np.array(d.z, np.float64) for d in (v, l))
     m = Plastic(mi.Color3f(1), mi.Float(0), mi.Float(alpha))
     plastic = (
-        np.array(rough_plastic.evaluate(m, Coat(IOR), mi.Vector3f(0, 0, 1), v, l).x, np.float64)
+        np.array(
+            rough_plastic.evaluate_plastic(m, Coat(IOR), mi.Vector3f(0, 0, 1), v, l).x, np.float64
+        )
         / cos_l
     )
     h = np.sqrt(np.clip(0.5 + 0.5 * np.array(dr.dot(v, l), np.float64), 0, 1))  # v·h
@@ -123,11 +125,11 @@ def test_both_coats_reflect_alike_at_normal_incidence(ks):
     assert float(fresnel(mi.Float(1), IOR)[0]) == pytest.approx(f0_from_ior(IOR), rel=1e-5)
     n = mi.Vector3f(0, 0, 1)
     for alpha in (0.05, 0.14, 0.3):
-        plastic = rough_plastic.evaluate(
+        plastic = rough_plastic.evaluate_plastic(
             Plastic(mi.Color3f(0), mi.Float(ks), mi.Float(alpha)), Coat(IOR), n, n, n
         )
         f0 = mi.Color3f(f0_from_ior(IOR) * ks)
-        gltf = brdf.evaluate(
+        gltf = brdf.evaluate_brdf(
             brdf.Surface(mi.Color3f(0), mi.Float(np.sqrt(alpha)), mi.Float(0), f0), n, n, n
         )
         assert float(gltf.x[0]) == pytest.approx(float(plastic.x[0]), rel=0.01)

@@ -10,9 +10,9 @@ from relit.materials.rough_plastic import (
     Coat,
     Plastic,
     crossing,
-    evaluate,
-    pdf,
-    sample,
+    evaluate_plastic,
+    plastic_pdf,
+    sample_plastic,
     transmittance_tables,
 )
 from support.twins.rough_plastic import plastic
@@ -34,7 +34,7 @@ def ours(kd, ks, alpha, ior, v, l):
     n = dr.zeros(mi.Vector3f, v.shape[1])
     n.z = 1
     m = Plastic(mi.Color3f(*kd), mi.Float(ks), mi.Float(alpha))
-    return np.array(evaluate(m, Coat(ior), n, mi.Vector3f(v), mi.Vector3f(l)))
+    return np.array(evaluate_plastic(m, Coat(ior), n, mi.Vector3f(v), mi.Vector3f(l)))
 
 
 @pytest.mark.parametrize("ior", [1.33, 1.49, 1.7])
@@ -80,7 +80,7 @@ def test_gradients():
         m = Plastic(mi.Color3f(p["kd"]), p["ks"], p["alpha"])
         bent = dr.normalize(n + mi.Vector3f(p["tilt"], 0, 0))
         to = dr.normalize(mi.Vector3f(l) + mi.Vector3f(0, p["light"], 0))
-        return dr.sum(evaluate(m, coat, bent, mi.Vector3f(v), to).y * weights)
+        return dr.sum(evaluate_plastic(m, coat, bent, mi.Vector3f(v), to).y * weights)
 
     coat = Coat(1.49)
     weights = mi.Float(np.random.default_rng(1).uniform(0, 1, 60))
@@ -108,7 +108,7 @@ def test_roughness_changes_the_diffuse_part():
     dr.enable_grad(alpha)
     m = Plastic(mi.Color3f(0.8), mi.Float(0), alpha)
     v, l = mi.Vector3f(0.6, 0, 0.8), mi.Vector3f(-0.28, 0, 0.96)
-    dr.backward(evaluate(m, Coat(), mi.Vector3f(0, 0, 1), v, l).x)
+    dr.backward(evaluate_plastic(m, Coat(), mi.Vector3f(0, 0, 1), v, l).x)
     assert abs(float(dr.grad(alpha)[0])) > 1e-3
 
 
@@ -134,11 +134,11 @@ def test_samples_follow_their_density():
     v = mi.Vector3f(0.6, 0, 0.8)
     rng = mi.PCG32(size=count)
     u = [rng.next_float32() for _ in range(3)]
-    l = sample(m, n, v, u[0], mi.Point2f(u[1], u[2]))
-    p = pdf(m, n, v, l)
+    l = sample_plastic(m, n, v, u[0], mi.Point2f(u[1], u[2]))
+    p = plastic_pdf(m, n, v, l)
     coat = Coat()
     drawn = float(
-        dr.mean(dr.select(p > 0, evaluate(m, coat, n, v, l).x / dr.maximum(p, 1e-9), 0))[0]
+        dr.mean(dr.select(p > 0, evaluate_plastic(m, coat, n, v, l).x / dr.maximum(p, 1e-9), 0))[0]
     )
     x, y = (
         a.ravel() for a in np.meshgrid((np.arange(800) + 0.5) / 800, (np.arange(800) + 0.5) / 800)
@@ -146,6 +146,6 @@ def test_samples_follow_their_density():
     l = mi.Vector3f(
         np.sqrt(1 - x**2) * np.cos(2 * np.pi * y), np.sqrt(1 - x**2) * np.sin(2 * np.pi * y), x
     )
-    exact = float(dr.mean(evaluate(m, coat, n, v, l).x)[0]) * 2 * np.pi
+    exact = float(dr.mean(evaluate_plastic(m, coat, n, v, l).x)[0]) * 2 * np.pi
     assert drawn == pytest.approx(exact, rel=0.02)
     assert exact < 0.9 + 0.1

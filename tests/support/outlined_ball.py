@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from relit.fit.shape.outlines import (
-    trace,
+    trace_rays,
 )
 from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
@@ -44,5 +44,5 @@ def coverage(mesh: Mesh, camera: Camera, side: int = 8) -> np.ndarray:
     part = (np.arange(side) + 0.5) / side
     y, x = np.mgrid[:SIZE, :SIZE]
     at = np.broadcast_arrays(x[..., None, None] + part, y[..., None, None] + part[:, None])
-    met = np.isfinite(trace(build_geometry(mesh), camera, at[0].ravel(), at[1].ravel())[0])
+    met = np.isfinite(trace_rays(build_geometry(mesh), camera, at[0].ravel(), at[1].ravel())[0])
     return met.reshape(SIZE, SIZE, side * side).mean(-1).astype(np.float32)

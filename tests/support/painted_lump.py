@@ -3,8 +3,8 @@
 import numpy as np
 import trimesh
 
-from relit.fit.shape.alignment import turned
-from relit.fit.shape.outlines import trace
+from relit.fit.shape.alignment import camera_after_motion
+from relit.fit.shape.outlines import trace_rays
 from relit.fit.shape.texture_shifts import shown_by
 from relit.geometry.se3 import exp_so3
 from relit.reference.mitsuba_scene import build_geometry
@@ -61,7 +61,7 @@ def shown(mesh: Mesh, cameras: list[Camera], paint=colours):
             np.broadcast_to(brightness, picture.shape)[seen.hit] * paint(seen.point)
         ).astype(np.float32)
         pictures.append(picture)
-        hit = np.isfinite(trace(scene, camera, at[0].ravel(), at[1].ravel())[0])
+        hit = np.isfinite(trace_rays(scene, camera, at[0].ravel(), at[1].ravel())[0])
         masks.append(hit.reshape(SIZE, SIZE, 16).mean(-1).astype(np.float32))
     return pictures, masks
 
@@ -69,7 +69,10 @@ def shown(mesh: Mesh, cameras: list[Camera], paint=colours):
 def astray(cameras, degrees, seed=0) -> list[Camera]:
     turns = np.random.default_rng(seed).normal(size=(len(cameras), 3))
     turns *= np.radians(degrees) / np.linalg.norm(turns, axis=1, keepdims=True)
-    return [turned(c, np.append(t, np.zeros(3))) for c, t in zip(cameras, turns, strict=True)]
+    return [
+        camera_after_motion(c, np.append(t, np.zeros(3)))
+        for c, t in zip(cameras, turns, strict=True)
+    ]
 
 
 def everywhere(masks) -> list[np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from relit.conventions import similarity
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.se3 import exp_so3
 from relit.scene import Camera
 
@@ -37,6 +37,8 @@ def views_of_body(angles, colour, lopsided=0.0, parts=None):
             p = pose[:3, 3] + np.where(hit, t, 0)[..., None] * (d @ turn.T)
             rgb[hit], best = colour(p[hit]), np.minimum(best, t)
         mask = np.isfinite(best).astype(np.float32)
-        views.append(View(k + 1, camera, rgb.astype(np.float32), mask, np.ones_like(mask), 1.0))
+        views.append(
+            InstanceView(k + 1, camera, rgb.astype(np.float32), mask, np.ones_like(mask), 1.0)
+        )
         poses.append(pose)
     return views, np.array(poses)

@@ -109,10 +109,10 @@ def cameras_from_json(data: dict, where: str | Path = "") -> tuple[tuple[str, Ca
 def read_cameras(path: str | Path) -> tuple[tuple[str, Camera], ...]:
     """(name, Camera) pairs of a `cameras.json` / `transforms.json` file with w, h, fl_x (or
     camera_angle_x) and OpenGL poses."""
-    return cameras_from_json(read_json(Path(path)), path)
+    return cameras_from_json(read_bounded_json(Path(path)), path)
 
 
-def read_json(path: Path) -> dict:
+def read_bounded_json(path: Path) -> dict:
     """A JSON object from a file of bounded size. Raises UserError."""
     if not path.is_file():
         raise UserError("a file is missing", fix=f"check the path: {path}")
@@ -250,7 +250,7 @@ def load_asset(folder_or_run: str | Path) -> Asset:
     """Read an asset folder (or the one in a run folder). Raises UserError for folders that are no
     asset, damaged or too new."""
     folder = find_asset(folder_or_run)
-    head = read_json(folder / "asset.json")
+    head = read_bounded_json(folder / "asset.json")
     schema = head.get("schema")
     if not isinstance(schema, int):
         raise UserError(

@@ -18,7 +18,7 @@ from relit.conventions import rotate_environment, srgb_from_linear, world_from_m
 from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals
 from relit.images import write_bytes, write_linear
-from relit.lighting.spherical_gaussians import fit_spherical_gaussians, write_json
+from relit.lighting.spherical_gaussians import fit_spherical_gaussians, write_lobes
 from relit.reference.mitsuba_scene import environment_bitmap
 from relit.scene import Asset, Material, Mesh
 
@@ -67,7 +67,7 @@ def write_gaussians(path: Path, asset: Asset) -> Path:
             "choose another format",
         )
     light = rotate_environment(asset.environment, np.linalg.inv(asset.world_from_asset))
-    write_json(path, fit_spherical_gaussians(light, LOBES))
+    write_lobes(path, fit_spherical_gaussians(light, LOBES))
     return path
 
 

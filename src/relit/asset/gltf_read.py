@@ -92,7 +92,7 @@ class _File:
     def resource(self, uri: str) -> bytes:
         if uri.startswith("data:"):
             return base64.b64decode(uri.split(",", 1)[1])
-        file = inside(self.path.parent, unquote(uri))
+        file = file_below(self.path.parent, unquote(uri))
         if not file.is_file():
             raise UserError(
                 "a file that the model refers to is missing", fix=f"put it beside the model: {file}"
@@ -160,7 +160,7 @@ class _File:
         return self.images[index]
 
 
-def inside(folder: Path, name: str) -> Path:
+def file_below(folder: Path, name: str) -> Path:
     """The file `name` in `folder` or below. Raises UserError for one that lies elsewhere: a model
     must not read the user's other files."""
     file = folder / name

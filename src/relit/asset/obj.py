@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.asset.gltf_read import decode_image, inside
+from relit.asset.gltf_read import decode_image, file_below
 from relit.asset.parts import Part, merge_parts
 from relit.conventions import linear_from_srgb
 from relit.errors import UserError
@@ -38,7 +38,7 @@ def read_obj(path: Path) -> tuple[Mesh, Material]:
             elif w[0] == "vn":
                 vn.append([float(x) for x in w[1:4]])
             elif w[0] == "mtllib":
-                materials.update(_read_mtl(inside(path.parent, " ".join(w[1:]))))
+                materials.update(_read_mtl(file_below(path.parent, " ".join(w[1:]))))
             elif w[0] == "usemtl":
                 current = " ".join(w[1:])
             elif w[0] == "f":
@@ -133,9 +133,9 @@ def _read_mtl(path: Path) -> dict[str, Material]:
 def _map(path: Path, words: list[str]) -> np.ndarray:
     """The image that a map_* entry names; options (-s 1 1 1 and the like) come before the file
     name."""
-    file = inside(path.parent, words[-1] if words else "")
+    file = file_below(path.parent, words[-1] if words else "")
     if not file.is_file():
-        file = inside(path.parent, " ".join(words))
+        file = file_below(path.parent, " ".join(words))
     if not file.is_file():
         raise UserError(
             "a texture that the material library names is missing",

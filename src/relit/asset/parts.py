@@ -33,7 +33,7 @@ class Part:
     material: Material
 
 
-def flat(part: Part) -> Part:
+def flat_shaded(part: Part) -> Part:
     """Each face gets its own corners and its own normal: what glTF means by missing normals."""
     corners = part.vertices[part.faces]
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -50,7 +50,7 @@ def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
     nothing is there."""
     if not parts:
         raise UserError("the model has no triangles", fix=f"check the file: {path}")
-    parts = [p if p.normals is not None else flat(p) for p in parts]
+    parts = [p if p.normals is not None else flat_shaded(p) for p in parts]
     keys = list(dict.fromkeys(p.key for p in parts))
     if len(keys) > 1:
         parts, material = _atlas(parts, keys, path)

@@ -59,7 +59,7 @@ def markdown(result: dict[str, Any], suite: Suite) -> str:
     return "\n".join(lines)
 
 
-def table(result: dict[str, Any], suite: Suite):
+def means_table(result: dict[str, Any], suite: Suite):
     """A rich Table of the means: one column a variant, one row a figure. A variant of which an
     object failed is a column of dashes."""
     from rich.table import Table

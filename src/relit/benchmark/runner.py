@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from relit.benchmark.cost import COST_DEFINITIONS, machine, timed
-from relit.benchmark.results import markdown, means, table
-from relit.benchmark.suites import SUITES, Item, Suite, named
+from relit.benchmark.results import markdown, means, means_table
+from relit.benchmark.suites import SUITES, Item, Suite, function_at
 from relit.errors import EXIT_FAILED, UserError, did_you_mean
 from relit.evaluate.results import entries
 from relit.files import write_text
@@ -59,7 +59,7 @@ def run_suite(
         Path(out) if out else store / "runs" / f"{suite}-{quality}-{time.strftime('%Y%m%d-%H%M%S')}"
     )
     captures = {item.name: synthesize_item(spec, item, data, store, say) for item in items}
-    evaluate, samples = named(spec.evaluate), {} if spp is None else {"spp": spp}
+    evaluate, samples = function_at(spec.evaluate), {} if spp is None else {"spp": spp}
 
     result: dict[str, Any] = {
         "suite": suite,
@@ -102,7 +102,7 @@ def run_suite(
             _save(result, spec, folder, json_file)
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else 160).print(table(result, spec))
+    Console(width=None if sys.stdout.isatty() else 160).print(means_table(result, spec))
     say(f"results: {folder / 'results.json'}, {folder / 'results.md'}")
     if failed := result["failed"]["plain"]:
         reasons = "\n".join(f"{name}: {reason}" for name, reason in failed.items())
@@ -149,11 +149,11 @@ def synthesize_item(
         data / item.light if isinstance(item.light, str) else [data / each for each in item.light]
     )
     options = {**suite.options, **item.options, "relights": [data / r for r in suite.relights]}
-    settings = named(suite.synthesize.rpartition(".")[0] + ".settings_of")(
+    settings = function_at(suite.synthesize.rpartition(".")[0] + ".settings_of")(
         data / item.asset, light, **options
     )
     out = cache / "captures" / f"{item.name}-{settings_hash(settings)}"
-    return named(suite.synthesize)(
+    return function_at(suite.synthesize)(
         data / item.asset, light, out, **options, say=lambda t: say(f"{item.name}: {t}")
     )
 

@@ -61,7 +61,7 @@ class Suite:
         return {"standard": self.bars, "draft": self.draft_bars}.get(quality, {}).get(figure)
 
 
-def named(path: str) -> Callable:
+def function_at(path: str) -> Callable:
     """The function 'module.function'."""
     module, _, function = path.rpartition(".")
     return getattr(importlib.import_module(module), function)

@@ -64,7 +64,7 @@ def guided_links(
     return links
 
 
-def agreeing(
+def consistent_matches(
     features: list[Features],
     links: dict[tuple[int, int], Link],
     poses: np.ndarray,
@@ -174,7 +174,7 @@ def tracks_of(links: dict[tuple[int, int], Link]) -> list[list[tuple[int, int]]]
     return [sorted(g) for g in groups.values() if len({k for k, _ in g}) == len(g)]
 
 
-def adjusted(
+def bundle_adjusted(
     features: list[Features],
     links: dict[tuple[int, int], Link],
     poses: np.ndarray,
@@ -260,11 +260,11 @@ def guided(
         if all(f.descriptors.size for f in features):
             now = guided_links(features, found, cameras, error)
         else:
-            now = agreeing(features, links, found, cameras)
+            now = consistent_matches(features, links, found, cameras)
         if not now:
             break
         count = len(now)
-        moved, _, (before, after) = adjusted(features, now, poses, cameras)
+        moved, _, (before, after) = bundle_adjusted(features, now, poses, cameras)
         near = np.array(
             [
                 rotation_angle(a[:3, :3].T @ b[:3, :3]) < FARTHEST

@@ -65,7 +65,7 @@ def load_matcher(setting: str) -> Matcher:
     return found
 
 
-def shown(rgb: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float]:
+def matcher_picture(rgb: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float]:
     """(picture as matchers take it, its pixels for one of the window)."""
     s = SIDE / max(rgb.shape[:2])
     size = (round(rgb.shape[1] * s), round(rgb.shape[0] * s))
@@ -75,7 +75,7 @@ def shown(rgb: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float]:
     return cv2.resize(np.round(code * 255).astype(np.uint8), size, interpolation=cv2.INTER_CUBIC), s
 
 
-def turned(picture: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+def rotated_picture(picture: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """The picture turned about its middle, in a frame that holds it whole, and the (2, 3) map from
     its pixels to the picture's."""
     h, w = picture.shape[:2]
@@ -97,7 +97,7 @@ def matches_at(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corresponding points (M, 2) of two pictures, b being turned for the matcher. Raises UserError
     for what is no such answer."""
-    picture, back = turned(b, degrees)
+    picture, back = rotated_picture(b, degrees)
     try:
         p, q = (np.asarray(x, np.float64).reshape(-1, 2) for x in matcher(a, picture))
         if len(p) != len(q) or not (np.isfinite(p).all() and np.isfinite(q).all()):
@@ -123,7 +123,7 @@ def link_by_matcher(
     """As `find_features` and `link_instances` together. windows: (rgb, mask, offset in the photo)
     of each instance. step: degrees of the sweep, a divisor of 360; FINE degrees to both sides of
     the best turn are tried where steps are longer."""
-    pictures = [shown(rgb, mask) for rgb, mask, _ in windows]
+    pictures = [matcher_picture(rgb, mask) for rgb, mask, _ in windows]
     points: list[list] = [[] for _ in windows]
 
     def photo_points(k: int, p: np.ndarray) -> np.ndarray:

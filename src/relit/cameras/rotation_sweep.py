@@ -98,7 +98,7 @@ def find_features(
     return Features(points, d.reshape(len(turns), len(keys), 128))
 
 
-def mutual(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mutual_matches(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of mutual nearest neighbours of unit descriptors that pass the ratio test."""
     if len(a) < 2 or len(b) < 2:
         return np.zeros(0, int), np.zeros(0, int)
@@ -129,12 +129,12 @@ def match_pair(a: Features, b: Features, sweep: bool = True) -> Link | None:
         return None
     upright = a.descriptors[0]
     turns = range(0, len(b.descriptors), COARSE) if sweep else (0,)
-    counts = np.array([len(mutual(upright, b.descriptors[t])[0]) for t in turns], float)
+    counts = np.array([len(mutual_matches(upright, b.descriptors[t])[0]) for t in turns], float)
     at = best_turn(counts) * COARSE if sweep else 0
     if sweep:
         around = [(at + k) % len(b.descriptors) for k in range(-COARSE + 1, COARSE)]
-        at = max(around, key=lambda t: len(mutual(upright, b.descriptors[t])[0]))
-    i, j = mutual(upright, b.descriptors[at])
+        at = max(around, key=lambda t: len(mutual_matches(upright, b.descriptors[t])[0]))
+    i, j = mutual_matches(upright, b.descriptors[at])
     return Link(i, j, at * float(STEP)) if len(i) >= LEAST else None
 
 
@@ -200,7 +200,7 @@ def link_instances(
         wrong = 0
         for away in (90, 180, 270):
             t = round((link.turn + away) / STEP) % len(b.descriptors)
-            x, y = mutual(a.descriptors[0], b.descriptors[t])
+            x, y = mutual_matches(a.descriptors[0], b.descriptors[t])
             control = (
                 verified(Link(x, y, 0.0), a, b, cameras[i], error, cameras[j])
                 if len(x) >= LEAST

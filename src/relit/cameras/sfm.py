@@ -20,7 +20,7 @@ import numpy as np
 from relit.cameras.strays import stray_photos
 from relit.capture.photo import with_camera
 from relit.capture.readers.colmap_model import camera_from_colmap, sparse_points, world_from_camera
-from relit.capture.sphere import View, check_sphere, find_sphere, up_direction
+from relit.capture.sphere import SphereView, check_sphere, find_sphere, up_direction
 from relit.device import load_pycolmap
 from relit.errors import EXIT_FAILED, UserError
 from relit.images import write_bytes, write_data, write_srgb
@@ -450,7 +450,8 @@ def _sphere(
     masks = dict(zip(names, small, strict=True))
     images = [i for i in map(model.image, model.reg_image_ids()) if i.name not in strays]
     views = [
-        View(*camera_from_colmap(i.camera, world_from_camera(i)), masks[i.name]) for i in images
+        SphereView(*camera_from_colmap(i.camera, world_from_camera(i)), masks[i.name])
+        for i in images
     ]
     try:
         return find_sphere(views, points)

@@ -42,7 +42,12 @@ def stray_photos(
         return [], np.ones(0 if points is None else len(points), bool)
     nobody = [], np.ones(len(points), bool)
     seen, held = np.moveaxis(
-        [shown(camera, mask, points) for camera, mask in zip(cameras, masks, strict=True)], 1, 0
+        [
+            expected_points(camera, mask, points)
+            for camera, mask in zip(cameras, masks, strict=True)
+        ],
+        1,
+        0,
     )
     here = np.ones(len(cameras), bool)
     while (
@@ -61,7 +66,9 @@ def stray_photos(
         here = still
 
 
-def shown(camera: Camera, mask: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def expected_points(
+    camera: Camera, mask: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(N,) bool each: points (N, 3) that a photo should show if they are on the object, and those
     that lie inside its mask (h, w), grown by two pixels. Where the mask reaches the border, as in a
     close-up, these are the points in its frame; else the whole object is."""

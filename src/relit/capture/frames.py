@@ -95,7 +95,7 @@ def check_max_side(max_side: int | None) -> None:
         )
 
 
-def inside(root: Path, name: str, source: Path) -> Path:
+def path_inside(root: Path, name: str, source: Path) -> Path:
     """root / name, refused when it leaves `root`. `source` is the file that names it."""
     name = name.replace("\\", "/")
     target = Path(os.path.normpath(root / name))
@@ -124,7 +124,7 @@ def read_text(path: Path) -> str:
         ) from error
 
 
-def read_json(path: Path) -> dict:
+def parse_json_file(path: Path) -> dict:
     """A JSON object. Raises UserError with line and column when it is malformed."""
     try:
         data = json.loads(read_text(path))

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from relit.capture.frames import read_json
+from relit.capture.frames import parse_json_file
 from relit.errors import UserError
 from relit.images.opencv import decode_file
 from relit.masks.rle import runs_from
@@ -87,7 +87,7 @@ def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
     """Instances of the scene's commonest object, from mask_visib/ (what can be seen of each) or
     mask/."""
     try:
-        truth = read_json(source)
+        truth = parse_json_file(source)
         chosen, entries = bop_object(truth), truth[str(int(photo.stem))]
         labels = np.zeros(shape, np.int32)
         for k, entry in enumerate(entries):
@@ -122,10 +122,10 @@ def _from_bop(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
 def which_objects(source: Path, photo: Path) -> str | None:
     """A note on which objects count, where the labels speak of several kinds."""
     if source.name == BOP_TRUTH:
-        return f"the objects are those with obj_id {bop_object(read_json(source))}, the commonest of the scene"
+        return f"the objects are those with obj_id {bop_object(parse_json_file(source))}, the commonest of the scene"
     if source.suffix.lower() != ".json":
         return None
-    data = read_json(source)
+    data = parse_json_file(source)
     if (chosen := _coco_category(data, photo)) is None:
         return None
     listed = data.get("categories")
@@ -169,7 +169,7 @@ def _coco_kind(annotation: dict) -> int:
 
 def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
     """Objects of the commonest category."""
-    data = read_json(file)
+    data = parse_json_file(file)
     images = [i for i in data["images"] if isinstance(i, dict)]
     entry = next((i for i in images if Path(str(i.get("file_name", ""))).name == photo.name), None)
     if entry is None and len(images) == 1:

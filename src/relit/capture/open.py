@@ -28,7 +28,7 @@ from relit.capture.readers import (
     sfd,
     transforms_json,
 )
-from relit.capture.sphere import View, check_sphere, settled_sphere, up_direction
+from relit.capture.sphere import SphereView, check_sphere, settled_sphere, up_direction
 from relit.errors import UserError, did_you_mean
 from relit.geometry.lens import lens_of
 from relit.images import Header, Image, read_small
@@ -114,7 +114,7 @@ def open_capture(
     }
     dropped = {i for i in empty if photos[i].name not in corrected}
     views = [
-        View(f.camera, f.lens or lens_of(f.camera), m, f.name) if f.camera else None
+        SphereView(f.camera, f.lens or lens_of(f.camera), m, f.name) if f.camera else None
         for f, m in zip(reading.frames, small, strict=True)
     ]
     photos = [with_calibration(p, f) for p, f in zip(photos, reading.frames, strict=True)]

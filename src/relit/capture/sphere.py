@@ -17,7 +17,7 @@ MOST_VIEWS = 40  # of the masks of a large capture, so many are carved with
 
 
 @dataclass(frozen=True)
-class View:
+class SphereView:
     """What the sphere is found from: a camera as calibrated, its lens, a small mask (h, w) of the
     same shape or None, the photo's name."""
 
@@ -27,7 +27,7 @@ class View:
     name: str = ""
 
 
-def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sphere, str]:
+def find_sphere(views: list[SphereView], points: np.ndarray | None = None) -> tuple[Sphere, str]:
     """-> (sphere, how it was found). Masks go first, then sparse points, then the cameras alone.
 
     Raises UserError when the cameras look away from each other, so that no sphere is seen by most
@@ -44,7 +44,7 @@ def find_sphere(views: list[View], points: np.ndarray | None = None) -> tuple[Sp
 
 
 def settled_sphere(
-    known: Sphere | None, presumed: bool, views: list[View], points: np.ndarray | None = None
+    known: Sphere | None, presumed: bool, views: list[SphereView], points: np.ndarray | None = None
 ) -> tuple[Sphere, str]:
     """The `known` sphere and "", or as `find_sphere`. presumed: the known one is but a convention,
     so where all views have masks these tell; the convention stands where they contradict one
@@ -156,7 +156,7 @@ def smallest_ball(points: np.ndarray, steps: int = 400) -> tuple[np.ndarray, flo
 # ---------------------------------------------------------------- masks
 
 
-def sphere_from_masks(views: list[View]) -> Sphere:
+def sphere_from_masks(views: list[SphereView]) -> Sphere:
     """Sphere about the visual hull: cells of a coarse grid that fall into the mask of (nearly)
     every view that shows them.
 
@@ -184,7 +184,7 @@ def sphere_from_masks(views: list[View]) -> Sphere:
 
 
 def _disagreement(
-    views: list[View], masks: list[np.ndarray], low: np.ndarray, high: np.ndarray
+    views: list[SphereView], masks: list[np.ndarray], low: np.ndarray, high: np.ndarray
 ) -> UserError:
     """Names the masks that miss what the others show, where a third of them or fewer does."""
     what = "the masks of different photos have no place in common"
@@ -209,7 +209,7 @@ def _disagreement(
     )
 
 
-def _mask_cone(view: View) -> tuple[np.ndarray, float]:
+def _mask_cone(view: SphereView) -> tuple[np.ndarray, float]:
     """World direction (3,) through the middle of a mask, and the half angle of the cone that holds
     it."""
     h, w = view.mask.shape
@@ -226,7 +226,7 @@ def _mask_cone(view: View) -> tuple[np.ndarray, float]:
 
 
 def _shown(
-    view: View, shape: tuple[int, int], points: np.ndarray
+    view: SphereView, shape: tuple[int, int], points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of points (K, 3): whether they fall into the picture (K,), and the column and row of its (h,
     w) copy that they fall on."""
@@ -243,7 +243,7 @@ def _shown(
 
 
 def _carve(
-    views: list[View], masks: list[np.ndarray], low, high, spare: float = 0.05
+    views: list[SphereView], masks: list[np.ndarray], low, high, spare: float = 0.05
 ) -> tuple[np.ndarray, np.ndarray]:
     """-> (centres (K, 3) of the cells that stay, size (3,) of a cell). A cell must be shown by half
     of the views, and two at least.

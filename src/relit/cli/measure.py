@@ -28,7 +28,7 @@ def evaluate_flags(parser: Parser) -> None:
 def do_evaluate(args) -> None:
     from relit.device import use_device
     from relit.evaluate.dispatch import evaluate
-    from relit.evaluate.results import table
+    from relit.evaluate.results import figures_table
     from relit.files import write_text
 
     use_device(args.device)
@@ -38,7 +38,7 @@ def do_evaluate(args) -> None:
         write_text(args.json, json.dumps(result, indent=1) + "\n")
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else 160).print(table(result))
+    Console(width=None if sys.stdout.isatty() else 160).print(figures_table(result))
 
 
 def benchmark_flags(parser: Parser) -> None:

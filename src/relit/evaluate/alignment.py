@@ -13,7 +13,7 @@ from relit.geometry import se3
 from relit.scene import Asset, Camera, Flash
 
 
-def umeyama(source, target, with_scale: bool = True) -> np.ndarray:
+def align_points(source, target, with_scale: bool = True) -> np.ndarray:
     """Least-squares similarity (4, 4) target_from_source of matched points (N, 3); Umeyama 1991,
     Eqs. 34-43.
 
@@ -34,7 +34,7 @@ def umeyama(source, target, with_scale: bool = True) -> np.ndarray:
     return se3.umeyama(x, y, with_scale)
 
 
-def align_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) -> np.ndarray:
+def align_named_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) -> np.ndarray:
     """truth_from_recovered (4, 4) similarity from the cameras that both hold under one name.
 
     Fitted on the camera centres together with one point ahead of each, at the mean distance of the
@@ -60,10 +60,12 @@ def align_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) -> np.
         )
     ahead_a = a[:, :3, 3] + a[:, :3, 2] * spread_a
     ahead_b = b[:, :3, 3] + b[:, :3, 2] * spread_b
-    return umeyama(np.concatenate([a[:, :3, 3], ahead_a]), np.concatenate([b[:, :3, 3], ahead_b]))
+    return align_points(
+        np.concatenate([a[:, :3, 3], ahead_a]), np.concatenate([b[:, :3, 3], ahead_b])
+    )
 
 
-def rotation_angle(a, b) -> float:
+def angle_between(a, b) -> float:
     """Angle in degrees between two rotations (3, 3)."""
     return se3.rotation_angle(np.asarray(a, np.float64).T @ np.asarray(b, np.float64))
 
@@ -76,7 +78,7 @@ def pose_errors(
     rotations, distances = [], []
     for name in sorted(set(recovered) & set(truth)):
         moved = move_pose(truth_from_recovered, recovered[name].world_from_camera)
-        rotations.append(rotation_angle(moved[:3, :3], truth[name].world_from_camera[:3, :3]))
+        rotations.append(angle_between(moved[:3, :3], truth[name].world_from_camera[:3, :3]))
         distances.append(float(np.linalg.norm(moved[:3, 3] - truth[name].centre)))
     return np.array(rotations), np.array(distances)
 
@@ -102,7 +104,7 @@ def aligned(
     photos and the frame is free."""
     if not recovered or same_frame(recovered, truth):
         return asset, "identity"
-    s = align_cameras(recovered, truth)
+    s = align_named_cameras(recovered, truth)
     k = scale_of(s)
     flash = (
         None if asset.flash is None else Flash(asset.flash.offset * k, asset.flash.intensity * k**2)

@@ -18,7 +18,7 @@ from relit.errors import UserError
 from relit.evaluate import definitions
 from relit.evaluate import metrics as m
 from relit.evaluate.multiview import fixed_albedo_scale, material_figures
-from relit.evaluate.results import entries, means
+from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
 from relit.evaluate.truth import Truth, camera_key
 from relit.geometry.se3 import align_cameras as align_poses
@@ -57,7 +57,7 @@ DEFINITIONS = {
 def load_collection_truth(folder: str | Path) -> Truth:
     """The truth of a synthetic collection as `evaluate.truth.Truth`. Raises UserError where it is
     not complete."""
-    from relit.asset.asset import read_cameras, read_json
+    from relit.asset.asset import read_bounded_json, read_cameras
 
     folder = Path(folder)
     file = folder / "truth" / "truth.json"
@@ -66,7 +66,7 @@ def load_collection_truth(folder: str | Path) -> Truth:
             "the folder holds no complete truth",
             fix=f"make one with `relit synthesize collection`: {folder}",
         )
-    meta = read_json(file)
+    meta = read_bounded_json(file)
     cameras = {
         camera_key(name): camera for name, camera in read_cameras(folder / "truth" / "cameras.json")
     }
@@ -82,10 +82,12 @@ def evaluate_collection(
     from relit.asset.asset import load_asset
 
     truth, asset = load_collection_truth(truth_folder), load_asset(run_or_asset)
-    return evaluate_asset(asset, truth, spp=spp, seed=seed)
+    return evaluate_collection_asset(asset, truth, spp=spp, seed=seed)
 
 
-def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0) -> dict[str, Any]:
+def evaluate_collection_asset(
+    asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0
+) -> dict[str, Any]:
     """As `evaluate_collection`, for an asset in memory."""
     from relit.reference.mitsuba_scene import build_scene
 
@@ -94,7 +96,7 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
         camera_key(name): (camera, light)
         for (name, camera), light in zip(asset.cameras, asset.lights, strict=True)
     }
-    values, world_from_found, per_view = pose_figures(
+    values, world_from_found, per_view = camera_pose_figures(
         {n: c for n, (c, _) in found.items()}, truth.train, truth.test
     )
     for i, name in enumerate(n for n in truth.test if n in found):
@@ -108,7 +110,7 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
     scale = fixed_albedo_scale(scene, truth)
     for name, camera in truth.test.items():
         per_view.setdefault(name, {}).update(material_figures(scene, camera, truth, name, scale))
-    values.update(means(per_view))
+    values.update(view_means(per_view))
     values.update(chamfer_figures(placed.mesh, placed.world_from_asset, truth))
     metrics = entries(values, {**definitions.DEFINITIONS, **DEFINITIONS})
     return {
@@ -128,7 +130,7 @@ def check_lights(asset: Asset) -> None:
         )
 
 
-def pose_figures(
+def camera_pose_figures(
     found: dict[str, Camera],
     train: dict[str, Camera],
     test: dict[str, Camera],

@@ -15,8 +15,13 @@ import numpy as np
 
 from relit.capture.readers import llff
 from relit.errors import UserError
-from relit.evaluate.collection import DEFINITIONS, check_lights, picture_figures, pose_figures
-from relit.evaluate.photos import SIDE, capture_of, shrunk
+from relit.evaluate.collection import (
+    DEFINITIONS,
+    camera_pose_figures,
+    check_lights,
+    picture_figures,
+)
+from relit.evaluate.photos import SIDE, capture_of, shrunk_to_camera
 from relit.evaluate.results import entries
 from relit.masks.grabcut import centre_cut
 from relit.scene import Asset, Camera, Capture, Photo
@@ -59,7 +64,7 @@ def evaluate_on_collection(
     notes = {}
     if len(train) >= 3:
         test = {name: truth[name] for name in held if name in truth}
-        values, _, turned = pose_figures(
+        values, _, turned = camera_pose_figures(
             {n: c for n, (c, _) in found.items()}, train, test, middle_of(train)
         )
         for name, figures in turned.items():
@@ -134,7 +139,7 @@ def reference_of(photo: Photo) -> tuple[np.ndarray, bool]:
         0.0,
         np.eye(4),
     )
-    rgb, mask = shrunk(pixels.rgb, size), shrunk(pixels.mask, size)
+    rgb, mask = shrunk_to_camera(pixels.rgb, size), shrunk_to_camera(pixels.mask, size)
     guessed = mask is None
     mask = np.clip(centre_cut(rgb) if guessed else mask, 0, 1)[..., None].astype(np.float32)
     return np.concatenate([rgb * mask, mask], -1), guessed

@@ -18,7 +18,7 @@ from relit.conventions import move_points, world_from_cv_camera
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.pile_alignment import grown_about, object_turn, scene_alignment
-from relit.evaluate.results import entries, means
+from relit.evaluate.results import entries, view_means
 from relit.files import parse_toml
 from relit.geometry.se3 import nearest_rotation, rotation_angle
 from relit.scene import Asset, Camera, Ground, Pixels
@@ -96,7 +96,7 @@ def evaluate_duplicates(
 ) -> dict[str, Any]:
     """Every figure that the truth allows, as `evaluate.dispatch.evaluate`. Raises UserError where
     the truth is unfinished."""
-    from relit.asset.asset import load_asset, read_json
+    from relit.asset.asset import load_asset, read_bounded_json
     from relit.images import read_data
     from relit.reference.mitsuba_scene import build_scene, render, render_channels
     from relit.reference.pile import build_pile
@@ -108,15 +108,17 @@ def evaluate_duplicates(
             "its rendering was stopped",
             f"make it again: {folder}",
         )
-    truth = read_json(folder / "truth" / "truth.json")
-    cameras = read_cameras(folder / "transforms_test.json")
-    photo = read_cameras(folder / "transforms_train.json")[0][1]
+    truth = read_bounded_json(folder / "truth" / "truth.json")
+    cameras = read_transforms(folder / "transforms_test.json")
+    photo = read_transforms(folder / "transforms_train.json")[0][1]
     true_poses = {i["label"]: np.array(i["world_from_object"]) for i in truth["instances"]}
     poses = {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
-    values = pose_figures(poses, true_poses, {i["label"]: i["visible"] for i in truth["instances"]})
+    values = instance_pose_figures(
+        poses, true_poses, {i["label"]: i["visible"] for i in truth["instances"]}
+    )
     before = poses_before(Path(run), photo, list(poses))
     if len(before) == len(poses):
-        earlier = pose_figures(before, true_poses, {})
+        earlier = instance_pose_figures(before, true_poses, {})
         values["rotation_before"], values["pairs_before"] = (
             earlier["rotation_median"],
             earlier["rotation_pairs"],
@@ -134,11 +136,10 @@ def evaluate_duplicates(
         centre_error(poses, true_poses, photo, scale, own_middle, true_points) / radius
     )
     values["surface_median"] = (
-        surface_error(poses, true_poses, photo, scale, frame, true_points[:: SAMPLES // 2000])
-        / radius
+        add_s(poses, true_poses, photo, scale, frame, true_points[:: SAMPLES // 2000]) / radius
     )
     own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
-    values["chamfer"] = chamfer(true_points, own, frame)
+    values["chamfer"] = sample_chamfer(true_points, own, frame)
 
     moved = [grown_about(photo.centre, scale) @ p for p in poses.values()]
     ground = None if asset.ground is None else scaled_ground(asset.ground, photo.centre, scale)
@@ -198,7 +199,7 @@ def evaluate_duplicates(
     values["environment_mse"] = m.environment_mse(asset.environment, light)
     values["environment_mse_scaled"] = m.environment_mse(asset.environment / factor, light)
     values["photo_psnr"] = photo_figure(asset, folder, spp=spp, seed=seed)
-    values |= means(per_view)
+    values |= view_means(per_view)
     return {
         "metrics": entries(values, DUPLICATES_DEFINITIONS),
         "per_view": per_view,
@@ -223,10 +224,10 @@ def evaluate_on_photo(
     reference = reference_poses(capture, asset.cameras[0][1])
     poses = {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
     if reference:
-        values.update(pose_figures(poses, reference, dict.fromkeys(reference, 1.0)))
+        values.update(instance_pose_figures(poses, reference, dict.fromkeys(reference, 1.0)))
         before = poses_before(Path(run), asset.cameras[0][1], list(poses))
         if len(before) == len(poses):
-            earlier = pose_figures(before, reference, {})
+            earlier = instance_pose_figures(before, reference, {})
             values["rotation_before"], values["pairs_before"] = (
                 earlier["rotation_median"],
                 earlier["rotation_pairs"],
@@ -237,7 +238,7 @@ def evaluate_on_photo(
 def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
     """SfD's own poses world_from_object (4, 4) by label; the object of each file entry is the one
     at whose label its middle lies. {} where there are none."""
-    from relit.asset.asset import read_json
+    from relit.asset.asset import read_bounded_json
     from relit.capture.readers.sfd import open_duplicates, recognise
 
     files = [capture / name for name in ("object_pred_pose.json", "object_scale_matrix.json")]
@@ -245,8 +246,8 @@ def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
     if source is None or not all(f.is_file() for f in files):
         return {}
     labels = open_duplicates(source, focal=camera.fx).photos[0].load().labels
-    listed = read_json(files[0])
-    middle = np.array(read_json(files[1])["scale_matrix"], np.float64)[:3, 3]
+    listed = read_bounded_json(files[0])
+    middle = np.array(read_bounded_json(files[1])["scale_matrix"], np.float64)[:3, 3]
     out = {}
     for name in sorted(listed):
         pose = np.array(listed[name], np.float64)
@@ -283,7 +284,7 @@ def photo_figure(
 ) -> float:
     """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr). run:
     whose settings say where the labels are from."""
-    from relit.evaluate.photos import shrunk
+    from relit.evaluate.photos import shrunk_to_camera
     from relit.reference.photographed import as_photographed
 
     pixels = labelled_pixels(capture, run, asset.cameras[0][1].fx) if asset.cameras else None
@@ -295,16 +296,19 @@ def photo_figure(
     camera = asset.cameras[0][1]
     own = np.isin(pixels.labels, [i.label for i in asset.instances if i.registered])
     camera = camera.within(PHOTO_SIDE)
-    rgb, where = shrunk(pixels.rgb, camera), shrunk(own.astype(np.float32), camera) >= m.MASK
+    rgb, where = (
+        shrunk_to_camera(pixels.rgb, camera),
+        shrunk_to_camera(own.astype(np.float32), camera) >= m.MASK,
+    )
     picture = as_photographed(asset)(asset.cameras[0][0], camera, spp=spp, seed=seed)
     return m.psnr(m.encode(picture[..., :3]), m.encode(rgb), where)
 
 
-def read_cameras(file: Path) -> list[tuple[str, Camera]]:
+def read_transforms(file: Path) -> list[tuple[str, Camera]]:
     """(name, Camera) pairs of a transforms file with one focal length."""
-    from relit.asset.asset import read_json
+    from relit.asset.asset import read_bounded_json
 
-    data = read_json(file)
+    data = read_bounded_json(file)
     w, h, f = data["w"], data["h"], float(data["focal"])
     return [
         (
@@ -326,7 +330,7 @@ def read_cameras(file: Path) -> list[tuple[str, Camera]]:
 # ---------------------------------------------------------------- poses
 
 
-def pose_figures(poses: dict, true_poses: dict, visible: dict) -> dict[str, float]:
+def instance_pose_figures(poses: dict, true_poses: dict, visible: dict) -> dict[str, float]:
     """rotation_median, rotation_worst, rotation_pairs and, where the visible shares are known,
     registered."""
     keys = [k for k in poses if k in true_poses]
@@ -388,7 +392,7 @@ def centre_error(
     return float(np.median(distances))
 
 
-def surface_error(
+def add_s(
     poses, true_poses, photo: Camera, scale: float, frame: np.ndarray, true_points: np.ndarray
 ) -> float:
     """ADD-S (Xiang et al. 2018, PoseCNN, Sec. V-A), the median over instances, in units of the
@@ -406,7 +410,7 @@ def surface_error(
     return float(np.median([d.mean() for d in found]))
 
 
-def chamfer(true_points: np.ndarray, own: np.ndarray, frame: np.ndarray) -> float:
+def sample_chamfer(true_points: np.ndarray, own: np.ndarray, frame: np.ndarray) -> float:
     """Mean of the two mean nearest distances between samples, in radii of the true object."""
     from scipy.spatial import cKDTree
 

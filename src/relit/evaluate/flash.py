@@ -20,7 +20,7 @@ import numpy as np
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.alignment import aligned
-from relit.evaluate.results import entries, means
+from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
 from relit.scene import Asset, Camera, Flash
 
@@ -96,7 +96,7 @@ def is_flash_truth(folder: str | Path) -> bool:
 
 def load_flash_truth(folder: str | Path) -> FlashTruth:
     """Read the truth. Raises UserError for what is missing."""
-    from relit.capture.readers.iron import read, read_light, recognise
+    from relit.capture.readers.iron import read, read_flash_light, recognise
 
     folder = Path(folder)
     if (folder / "truth" / "settings.json").is_file() and not (
@@ -115,7 +115,7 @@ def load_flash_truth(folder: str | Path) -> FlashTruth:
             f"give another folder: {folder}",
         )
     reading = read(folder, found)
-    intensity, offset = read_light(folder)
+    intensity, offset = read_flash_light(folder)
     if intensity is None:
         raise UserError(
             "light.txt is missing: the true intensity of the flash is not known",
@@ -142,7 +142,7 @@ def load_flash_truth(folder: str | Path) -> FlashTruth:
     )
 
 
-def placed(asset: Asset, truth: FlashTruth) -> Asset:
+def in_true_frame(asset: Asset, truth: FlashTruth) -> Asset:
     """The asset in the frame of the true cameras: as it is where they were given, else moved, with
     its flash, by a similarity."""
     return aligned(asset, truth.train, {Path(name).stem: camera for name, camera in asset.cameras})[
@@ -179,14 +179,14 @@ def evaluate_flash_asset(
             "it was not made from a flash capture",
             "reconstruct with --capture flash",
         )
-    asset = placed(asset, truth)
+    asset = in_true_frame(asset, truth)
     scene = build_flash_scene(asset.mesh, asset.material, asset.world_from_asset)
     ratio = float(asset.flash.intensity.mean() / truth.flash.intensity.mean())
     per_view = {
         name: view_figures(scene, asset, truth, name, camera, ratio, spp, seed + i)
         for i, (name, camera) in enumerate(truth.test.items())
     }
-    values = means(per_view)
+    values = view_means(per_view)
     values["flash_angle"] = seen_angle(
         asset.flash, truth.flash, list(truth.test.values()), truth.centre
     )

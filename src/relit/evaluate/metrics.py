@@ -109,7 +109,7 @@ def albedo_scale(predicted, truth) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfacePoints:
     """Points on a triangle mesh. points: (N, 3) float64. triangle: (N,) the face each lies on.
     uniform: (N,) bool, true for samples uniform by area, false for face centres, which make sure
     that a face between samples is found. corners: (F, 3, 3) of the faces."""
@@ -119,12 +119,14 @@ class Surface:
     uniform: np.ndarray
     corners: np.ndarray
 
-    def only(self, keep) -> Surface:
+    def only(self, keep) -> SurfacePoints:
         """The points where `keep` (N,) is true."""
-        return Surface(self.points[keep], self.triangle[keep], self.uniform[keep], self.corners)
+        return SurfacePoints(
+            self.points[keep], self.triangle[keep], self.uniform[keep], self.corners
+        )
 
 
-def sample_surface(vertices, faces, count: int, seed: int = 0) -> Surface:
+def sample_surface(vertices, faces, count: int, seed: int = 0) -> SurfacePoints:
     """`count` points uniform by area on a triangle mesh, and the centre of every face."""
     corners = np.asarray(vertices, np.float64)[np.asarray(faces)]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -138,7 +140,7 @@ def sample_surface(vertices, faces, count: int, seed: int = 0) -> Surface:
     flip = u + w > 1
     u, w = np.where(flip, 1 - u, u), np.where(flip, 1 - w, w)
     samples = corners[index, 0] + u[:, None] * e1[index] + w[:, None] * e2[index]
-    return Surface(
+    return SurfacePoints(
         np.concatenate([samples, corners.mean(1)]),
         np.concatenate([index, np.arange(len(corners))]),
         np.arange(count + len(corners)) < count,
@@ -167,7 +169,7 @@ def closest_on_triangles(p, a, b, c) -> np.ndarray:
     return np.where(inside & (dot(n, n) > 1e-30), foot, best)
 
 
-def distance_to_surface(points, surface: Surface, candidates: int = 8) -> np.ndarray:
+def distance_to_surface(points, surface: SurfacePoints, candidates: int = 8) -> np.ndarray:
     """(N,) distance from points (N, 3) to the triangles under the `candidates` nearest points of a
     surface, in the points' unit.
 
@@ -183,7 +185,7 @@ def distance_to_surface(points, surface: Surface, candidates: int = 8) -> np.nda
     ).min(1)
 
 
-def chamfer(a: Surface, b: Surface) -> tuple[float, float, float]:
+def chamfer(a: SurfacePoints, b: SurfacePoints) -> tuple[float, float, float]:
     """(mean of the two, a to b, b to a): mean distance from the samples of each surface to the
     other surface. Not squared."""
     to_b, to_a = (

@@ -14,7 +14,7 @@ import numpy as np
 from relit.evaluate import metrics as m
 from relit.evaluate.alignment import aligned, pose_errors
 from relit.evaluate.definitions import DEFINITIONS
-from relit.evaluate.results import entries, means
+from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
 from relit.evaluate.truth import Truth, camera_key
 from relit.scene import Asset, Camera
@@ -71,7 +71,7 @@ def evaluate_asset(asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0)
         )
         values["camera_rotation"] = float(np.median(rotations))
         values["camera_centre_percent"] = float(100 * np.median(distances) / (2 * truth.radius))
-    values = {**means(per_view), **values}
+    values = {**view_means(per_view), **values}
     return {
         "metrics": entries(values, DEFINITIONS),
         "per_view": per_view,

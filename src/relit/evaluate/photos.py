@@ -150,7 +150,7 @@ def photo_figures(
     the object sphere. show: see `reference.photographed.as_photographed`."""
     pixels, camera = photo.load(), photo.camera
     camera = camera.within(SIDE)
-    rgb, mask = (shrunk(a, camera) for a in (pixels.rgb, pixels.mask))
+    rgb, mask = (shrunk_to_camera(a, camera) for a in (pixels.rgb, pixels.mask))
     shown = show(photo.name, camera, spp=spp, seed=seed)
     alpha = shown[..., 3]
     if mask is not None:
@@ -168,7 +168,7 @@ def photo_figures(
         else sample_environment(asset.environment, d) * (1 - alpha[..., None])
     )
     a, b = m.encode(shown[..., :3] + behind), m.encode(rgb)
-    ball = np.ones(alpha.shape, bool) if sphere is None else meets(camera, d, sphere)
+    ball = np.ones(alpha.shape, bool) if sphere is None else meets_sphere(camera, d, sphere)
     covered = ball & (alpha >= m.MASK)
     share = float(covered.sum() / max(ball.sum(), 1))
     return {
@@ -178,7 +178,7 @@ def photo_figures(
     }
 
 
-def shrunk(image: np.ndarray | None, camera: Camera) -> np.ndarray | None:
+def shrunk_to_camera(image: np.ndarray | None, camera: Camera) -> np.ndarray | None:
     """Area-averaged to the camera's size."""
     if image is None or image.shape[:2] == (camera.height, camera.width):
         return image
@@ -195,7 +195,7 @@ def directions(camera: Camera) -> np.ndarray:
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def meets(camera: Camera, d: np.ndarray, sphere: Sphere) -> np.ndarray:
+def meets_sphere(camera: Camera, d: np.ndarray, sphere: Sphere) -> np.ndarray:
     """(H, W) bool: pixels whose ray meets the sphere."""
     o = camera.centre - sphere.centre
     along = d @ o

@@ -19,7 +19,7 @@ def entries(
     }
 
 
-def means(per_view: dict[str, dict[str, float]]) -> dict[str, float]:
+def view_means(per_view: dict[str, dict[str, float]]) -> dict[str, float]:
     """Mean of each per-view figure over views, and over lights where there are several
     ('name:light')."""
     gathered: dict[str, list[float]] = {}
@@ -29,7 +29,7 @@ def means(per_view: dict[str, dict[str, float]]) -> dict[str, float]:
     return {key: float(np.mean(values)) for key, values in gathered.items()}
 
 
-def table(result: dict[str, Any], title: str = "", definitions: bool = True):
+def figures_table(result: dict[str, Any], title: str = "", definitions: bool = True):
     """A rich Table of the figures, with what each means."""
     from rich.table import Table
 

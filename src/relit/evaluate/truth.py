@@ -57,7 +57,7 @@ def has_truth(folder: str | Path) -> bool:
 def load_truth(folder: str | Path) -> Truth:
     """Read the cameras and the description of a synthetic capture. Raises UserError where there is
     none, or an unfinished one."""
-    from relit.asset.asset import read_json
+    from relit.asset.asset import read_bounded_json
 
     folder = Path(folder)
     folder = folder.parent if folder.name == "truth" else folder
@@ -73,7 +73,7 @@ def load_truth(folder: str | Path) -> Truth:
             why,
             f"make one with `relit synthesize`, or give its folder: {folder}",
         )
-    meta = read_json(file)
+    meta = read_bounded_json(file)
     size = meta["settings"]["resolution"]
     train, test = (
         _read_cameras(folder / f"transforms_{split}.json", size) for split in ("train", "test")
@@ -82,9 +82,9 @@ def load_truth(folder: str | Path) -> Truth:
 
 
 def _read_cameras(file: Path, size: int) -> dict[str, Camera]:
-    from relit.asset.asset import read_json
+    from relit.asset.asset import read_bounded_json
 
-    content = read_json(file)
+    content = read_bounded_json(file)
     focal = size / (2 * np.tan(content["camera_angle_x"] / 2))
     return {
         camera_key(f["file_path"]): Camera(

@@ -49,7 +49,7 @@ def rounded(mesh: Mesh, axis: Axis, step: float) -> Mesh:
     axis: nearly that of the body. step: of the grid that the mesh was extracted from, in its
     units."""
     for _ in range(CENTRED):
-        axis = centred(mesh, axis, step)
+        axis = refine_axis(mesh, axis, step)
     for _ in range(ROUNDS):
         shift, normal, *_ = along_profile(mesh, axis, step)
         moved = replace(mesh, vertices=(mesh.vertices + shift[:, None] * normal).astype(np.float32))
@@ -57,7 +57,7 @@ def rounded(mesh: Mesh, axis: Axis, step: float) -> Mesh:
     return mesh
 
 
-def centred(mesh: Mesh, axis: Axis, step: float) -> Axis:
+def refine_axis(mesh: Mesh, axis: Axis, step: float) -> Axis:
     """The axis after one Gauss-Newton step: moved and leant so that least is left to move the
     vertices by, as whatever stands out on one side pulls at the normals (`revolution_axis`). A body
     that is moved by a + ω x r against its axis asks for -n . (a + ω x r)."""

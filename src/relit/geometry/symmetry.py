@@ -44,11 +44,11 @@ def symmetry_plane(points: np.ndarray, seed: int = 0) -> tuple[Plane, float]:
     planes = [Plane(n, float(n @ middle)) for n in half_sphere(NORMALS)]
     few = some[:: max(1, len(some) // 300)]
     order = np.argsort([distances(p, few, tree).mean() for p in planes])[:LOOKED_AT]
-    settled = [settle(planes[k], some, tree) for k in order]
+    settled = [refine_plane(planes[k], some, tree) for k in order]
     return min(settled, key=lambda one: one[1])
 
 
-def settle(plane: Plane, points: np.ndarray, tree: cKDTree) -> tuple[Plane, float]:
+def refine_plane(plane: Plane, points: np.ndarray, tree: cKDTree) -> tuple[Plane, float]:
     for _ in range(ROUNDS):
         distance, partner = tree.query(move_points(plane.mirror, points))
         near = distance <= np.quantile(distance, TRIMMED)

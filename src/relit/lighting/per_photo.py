@@ -24,7 +24,7 @@ TEXELS = ROWS * COLUMNS
 
 
 @lru_cache(maxsize=1)
-def light_prior() -> tuple[np.ndarray, np.ndarray]:
+def load_light_prior() -> tuple[np.ndarray, np.ndarray]:
     """(mean (TEXELS * 3,), basis (K, TEXELS * 3)), float32: row-major log RGB; components scaled by
     their standard deviations."""
     with (
@@ -60,7 +60,7 @@ class LightComponents:
 def log_lights(numbers: np.ndarray, gains: np.ndarray, family=None) -> np.ndarray:
     """(V, TEXELS * 3) log radiance of numbers (V, K) and log gains (V, 3). family: of lights, by
     default the shipped one."""
-    family = LightComponents(*light_prior()) if family is None else family
+    family = LightComponents(*load_light_prior()) if family is None else family
     return (family.log_maps(numbers) + np.tile(gains, (1, TEXELS))).astype(np.float32)
 
 

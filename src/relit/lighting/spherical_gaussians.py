@@ -34,7 +34,7 @@ class SphericalGaussians:
     amplitude: np.ndarray
 
 
-def evaluate(sg: SphericalGaussians, direction) -> np.ndarray:
+def gaussian_radiance(sg: SphericalGaussians, direction) -> np.ndarray:
     """Radiance (..., 3) from unit directions (..., 3): SfD Eq. (2)."""
     d = np.asarray(direction, np.float64)
     flat = d.reshape(-1, 3)
@@ -66,7 +66,7 @@ def environment_of(sg: SphericalGaussians, height: int = 128, width: int = 256) 
     sigma = 1 / np.sqrt(max(float(np.max(sg.sharpness, initial=1.0)), 1e-6))
     n = int(np.clip(np.ceil(np.pi / height / (0.7 * sigma)), 1, 8))
     weight = environment_solid_angles(height * n, width * n)[..., None]
-    fine = evaluate(sg, environment_directions(height * n, width * n)) * weight
+    fine = gaussian_radiance(sg, environment_directions(height * n, width * n)) * weight
     mean = lambda a: a.reshape(height, n, width, n, -1).sum((1, 3))  # noqa: E731
     return (mean(fine) / mean(weight)).astype(np.float32)
 
@@ -187,7 +187,7 @@ def _start(d, share, count: int, rng):
 # ---------------------------------------------------------------- files
 
 
-def write_json(path: str | Path, sg: SphericalGaussians) -> None:
+def write_lobes(path: str | Path, sg: SphericalGaussians) -> None:
     """{"lobes": [{"axis": [x, y, z], "sharpness": lambda, "amplitude": [r, g, b]}, ...]}"""
     lobes = [
         {"axis": a.tolist(), "sharpness": float(s), "amplitude": m.tolist()}
@@ -198,8 +198,8 @@ def write_json(path: str | Path, sg: SphericalGaussians) -> None:
     write_bytes(path, (json.dumps({"lobes": lobes}, indent=1) + "\n").encode())
 
 
-def read_json(path: str | Path) -> SphericalGaussians:
-    """Inverse of `write_json`. Raises UserError for a file that is not one."""
+def read_lobes(path: str | Path) -> SphericalGaussians:
+    """Inverse of `write_lobes`. Raises UserError for a file that is not one."""
     path = Path(path)
     try:
         if path.stat().st_size > 16 << 20:

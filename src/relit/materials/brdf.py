@@ -112,7 +112,7 @@ def lobe_albedo(n_dot_v, roughness):
     return dr.lerp(dr.lerp(g(0), g(1), fx), dr.lerp(g(TABLE), g(TABLE + 1), fx), fy)
 
 
-def evaluate(m: Surface, n, v, l):
+def evaluate_brdf(m: Surface, n, v, l):
     """BRDF times the light's cosine, f(v, l) max(n.l, 0): Color3f. Differentiable in m, n, v, l."""
     n_dot_l, n_dot_v = dr.maximum(dr.dot(n, l), 0), dr.maximum(dr.dot(n, v), MIN_COS)
     h = dr.normalize(v + l)
@@ -143,8 +143,8 @@ def _seen(n, v):
     return dr.normalize(wo)
 
 
-def sample(m: Surface, n, v, u_lobe, u2):
-    """Direction l drawn from `pdf`; u_lobe: Float, u2: Point2f, uniform in [0, 1). May fall below
+def sample_brdf(m: Surface, n, v, u_lobe, u2):
+    """Direction l drawn from `brdf_pdf`; u_lobe: Float, u2: Point2f, uniform in [0, 1). May fall below
     the horizon (pdf 0)."""
     with dr.suspend_grad():
         frame = mi.Frame3f(n)
@@ -160,8 +160,8 @@ def sample(m: Surface, n, v, u_lobe, u2):
         return frame.to_world(dr.select(u_lobe < specular_share(m, n, v), l_spec, l_diff))
 
 
-def pdf(m: Surface, n, v, l):
-    """Density of `sample` in solid angle (Float, detached)."""
+def brdf_pdf(m: Surface, n, v, l):
+    """Density of `sample_brdf` in solid angle (Float, detached)."""
     with dr.suspend_grad():
         wo = _seen(n, v)
         n_dot_l, n_dot_v = dr.dot(n, l), wo.z

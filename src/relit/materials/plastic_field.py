@@ -48,7 +48,7 @@ def plastic_at(field: PlasticField, uv, active=True):
     return Plastic(mi.Color3f(diffuse.x, diffuse.y, diffuse.z), lobe.x, lobe.y), slope
 
 
-def project(field: PlasticField) -> None:
+def project_plastic(field: PlasticField) -> None:
     """Clip every texel to what a material may be."""
     field.diffuse = dr.clip(field.diffuse, 0, 1)
     second = dr.arange(mi.UInt32, dr.width(field.lobe)) % 2 == 1

@@ -154,7 +154,7 @@ class Coat:
         )
 
 
-def ggx_d(n_dot_h, alpha):
+def walter_ggx_d(n_dot_h, alpha):
     """GGX: Walter et al. 2007, Eq. 33."""
     a2 = dr.square(alpha)
     return a2 / (dr.pi * dr.square(dr.fma(dr.square(n_dot_h), a2 - 1, 1)))
@@ -181,7 +181,7 @@ def base_radiance(diffuse, coat: Coat, cos_v, alpha, entered):
     )
 
 
-def evaluate(m: Plastic, coat: Coat, n, v, l):
+def evaluate_plastic(m: Plastic, coat: Coat, n, v, l):
     """BRDF times the light's cosine, f(v, l) max(n.l, 0): Color3f. Differentiable in m, n, v, l."""
     n_dot_l, n_dot_v = dr.dot(n, l), dr.maximum(dr.dot(n, v), MIN_COS)
     lit = n_dot_l > 1e-4
@@ -191,7 +191,7 @@ def evaluate(m: Plastic, coat: Coat, n, v, l):
     n_dot_h, v_dot_h = dr.clip(dr.dot(n, h), 0, 1), dr.clip(dr.dot(v, h), 0, 1)
     lobe = (
         fresnel(v_dot_h, coat.ior)
-        * ggx_d(n_dot_h, alpha)
+        * walter_ggx_d(n_dot_h, alpha)
         * smith_g1(n_dot_l, alpha)
         * smith_g1(n_dot_v, alpha)
         / (4 * n_dot_v)
@@ -202,8 +202,8 @@ def evaluate(m: Plastic, coat: Coat, n, v, l):
     return mi.Color3f(dr.select(lit, base + m.specular * lobe, 0))
 
 
-def sample(m: Plastic, n, v, u_lobe, u2):
-    """Direction l drawn from `pdf`: visible normals of the lobe, or the cosine; u_lobe: Float, u2:
+def sample_plastic(m: Plastic, n, v, u_lobe, u2):
+    """Direction l drawn from `plastic_pdf`: visible normals of the lobe, or the cosine; u_lobe: Float, u2:
     Point2f. May fall below the horizon."""
     with dr.suspend_grad():
         frame = mi.Frame3f(n)
@@ -222,14 +222,14 @@ def sample(m: Plastic, n, v, u_lobe, u2):
         )
 
 
-def pdf(m: Plastic, n, v, l):
-    """Density of `sample` in solid angle (Float, detached)."""
+def plastic_pdf(m: Plastic, n, v, l):
+    """Density of `sample_plastic` in solid angle (Float, detached)."""
     with dr.suspend_grad():
         wo = mi.Frame3f(n).to_local(v)
         wo.z = dr.maximum(wo.z, MIN_COS)
         wo = dr.normalize(wo)
         a = dr.maximum(m.alpha, MIN_ALPHA)
         h = dr.normalize(mi.Frame3f(n).to_world(wo) + l)
-        lobe = ggx_d(dr.clip(dr.dot(n, h), 0, 1), a) * smith_g1(wo.z, a) / (4 * wo.z)
+        lobe = walter_ggx_d(dr.clip(dr.dot(n, h), 0, 1), a) * smith_g1(wo.z, a) / (4 * wo.z)
         cos = dr.dot(n, l)
         return dr.select(cos > 0, LOBE_SHARE * lobe + (1 - LOBE_SHARE) * cos * dr.inv_pi, 0)

@@ -44,7 +44,7 @@ def shading_normal(si, normalmap, active=True):
     return dr.select(seen_from_behind, -n, n)
 
 
-def register() -> str:
+def register_bsdf() -> str:
     """Make the plugin known to the present Mitsuba variant; returns its name."""
     _register(mi.variant())
     return PLUGIN
@@ -81,28 +81,28 @@ def _register(variant: str) -> None:
 
         def eval(self, ctx, si, wo, active=True):
             n = shading_normal(si, self.normalmap, active)
-            return dr.select(active, brdf.evaluate(self.surface(si, active), n, si.wi, wo), 0)
+            return dr.select(active, brdf.evaluate_brdf(self.surface(si, active), n, si.wi, wo), 0)
 
         def pdf(self, ctx, si, wo, active=True):
             n = shading_normal(si, self.normalmap, active)
-            return dr.select(active, brdf.pdf(self.surface(si, active), n, si.wi, wo), 0)
+            return dr.select(active, brdf.brdf_pdf(self.surface(si, active), n, si.wi, wo), 0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
             m, n = self.surface(si, active), shading_normal(si, self.normalmap, active)
-            return dr.select(active, brdf.evaluate(m, n, si.wi, wo), 0), dr.select(
-                active, brdf.pdf(m, n, si.wi, wo), 0
+            return dr.select(active, brdf.evaluate_brdf(m, n, si.wi, wo), 0), dr.select(
+                active, brdf.brdf_pdf(m, n, si.wi, wo), 0
             )
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             m, n = self.surface(si, active), shading_normal(si, self.normalmap, active)
             bs = mi.BSDFSample3f()
-            bs.wo = brdf.sample(m, n, si.wi, sample1, sample2)
-            bs.pdf = dr.select(active, brdf.pdf(m, n, si.wi, bs.wo), 0)
+            bs.wo = brdf.sample_brdf(m, n, si.wi, sample1, sample2)
+            bs.pdf = dr.select(active, brdf.brdf_pdf(m, n, si.wi, bs.wo), 0)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = mi.UInt32(0)
             ok = active & (bs.pdf > 0)
-            weight = brdf.evaluate(m, n, si.wi, bs.wo) / dr.select(ok, bs.pdf, 1)
+            weight = brdf.evaluate_brdf(m, n, si.wi, bs.wo) / dr.select(ok, bs.pdf, 1)
             return bs, dr.select(ok, weight, 0)
 
         def traverse(self, cb):

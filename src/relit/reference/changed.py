@@ -53,7 +53,7 @@ def change_of(
     """
     h, w = own.shape
     rim = np.zeros_like(own) if rim is None else rim & ~own
-    told = Told(progress)
+    told = JointProgress(progress)
     if max(h, w) <= LEAST:
         change, near = np.zeros_like(picture), ~own
     else:
@@ -100,7 +100,7 @@ def _smoothed(picture: np.ndarray, where: np.ndarray, width: float) -> np.ndarra
     return cv2.GaussianBlur(picture * where[..., None], (0, 0), width) / np.maximum(share, 1e-3)
 
 
-class Told:
+class JointProgress:
     """Counts pixels of several renderings as one progress."""
 
     def __init__(self, progress: Callable[[int, int], None] | None):

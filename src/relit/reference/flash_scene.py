@@ -47,7 +47,7 @@ class FlashScene:
     parameters: Any
 
 
-def register() -> str:
+def register_flash() -> str:
     """Make the plugin known to the present Mitsuba variant; returns its name."""
     _register(mi.variant())
     return PLUGIN
@@ -84,13 +84,17 @@ def _register(variant: str) -> None:
 
         def eval(self, ctx, si, wo, active=True):
             n = shading_normal(si, self.normalmap, active)
-            value = rough_plastic.evaluate(self.surface(si, active), self.coat, n, si.wi, wo)
+            value = rough_plastic.evaluate_plastic(
+                self.surface(si, active), self.coat, n, si.wi, wo
+            )
             return dr.select(self._seen(si, active) & (mi.Frame3f.cos_theta(wo) > 0), value, 0)
 
         def pdf(self, ctx, si, wo, active=True):
             n = shading_normal(si, self.normalmap, active)
             return dr.select(
-                self._seen(si, active), rough_plastic.pdf(self.surface(si, active), n, si.wi, wo), 0
+                self._seen(si, active),
+                rough_plastic.plastic_pdf(self.surface(si, active), n, si.wi, wo),
+                0,
             )
 
         def eval_pdf(self, ctx, si, wo, active=True):
@@ -99,13 +103,13 @@ def _register(variant: str) -> None:
         def sample(self, ctx, si, sample1, sample2, active=True):
             m, n = self.surface(si, active), shading_normal(si, self.normalmap, active)
             bs = mi.BSDFSample3f()
-            bs.wo = rough_plastic.sample(m, n, si.wi, sample1, sample2)
-            bs.pdf = dr.select(active, rough_plastic.pdf(m, n, si.wi, bs.wo), 0)
+            bs.wo = rough_plastic.sample_plastic(m, n, si.wi, sample1, sample2)
+            bs.pdf = dr.select(active, rough_plastic.plastic_pdf(m, n, si.wi, bs.wo), 0)
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = mi.UInt32(0)
             ok = self._seen(si, active) & (bs.pdf > 0) & (mi.Frame3f.cos_theta(bs.wo) > 0)
-            weight = rough_plastic.evaluate(m, self.coat, n, si.wi, bs.wo) / dr.select(
+            weight = rough_plastic.evaluate_plastic(m, self.coat, n, si.wi, bs.wo) / dr.select(
                 ok, bs.pdf, 1
             )
             return bs, dr.select(ok, weight, 0)
@@ -147,7 +151,7 @@ def build_flash_scene(mesh: Mesh, material: Material, world_from_asset=None) -> 
         else mitsuba_texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),
     }
     d = {
-        "type": register(),
+        "type": register_flash(),
         "int_ior": float(material.ior),
         **{k: v for k, v in t.items() if v is not None},
     }

@@ -19,7 +19,7 @@ from relit.conventions import move_points, move_pose, scale_of, similarity
 from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals, vertex_tangents
 from relit.reference import bsdf as relit_bsdf
-from relit.reference.path import SmoothOrigins, trace
+from relit.reference.path import SmoothOrigins, trace_path
 from relit.scene import Camera, Material, Mesh
 
 RAYS_PER_PASS = 1 << 21  # bounds the memory of a pass: about 50 bytes a ray
@@ -151,7 +151,7 @@ def build_scene(
     }
     if bsdf == "relit":
         d = {
-            "type": relit_bsdf.register(),
+            "type": relit_bsdf.register_bsdf(),
             "int_ior": float(material.ior),
             **{k: v for k, v in t.items() if v is not None},
         }
@@ -280,7 +280,7 @@ def render(
         if scene.origins is None:
             color, hit, _ = path.sample(scene.mi_scene, sampler, ray)
         else:
-            color, hit = trace(
+            color, hit = trace_path(
                 scene.mi_scene,
                 scene.mi_scene.shapes()[0].bsdf(),
                 scene.origins,

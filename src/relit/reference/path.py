@@ -60,7 +60,7 @@ def _balance(a, b):
 
 
 @dr.syntax
-def trace(scene, bsdf, origins, sampler, ray, max_depth):
+def trace_path(scene, bsdf, origins, sampler, ray, max_depth):
     """Radiance (Color3f) along `ray` and whether it meets the object (Bool). The light is not seen
     by the camera.
 
@@ -99,17 +99,17 @@ def trace(scene, bsdf, origins, sampler, ray, max_depth):
         L += dr.select(
             lit,
             beta
-            * brdf.evaluate(m, n, si.wi, wl)
+            * brdf.evaluate_brdf(m, n, si.wi, wl)
             * light
-            * _balance(ds.pdf, brdf.pdf(m, n, si.wi, wl)),
+            * _balance(ds.pdf, brdf.brdf_pdf(m, n, si.wi, wl)),
             0,
         )
 
         # ---- the next direction
-        wo = brdf.sample(m, n, si.wi, sampler.next_1d(), sampler.next_2d())
-        pdf = brdf.pdf(m, n, si.wi, wo)
+        wo = brdf.sample_brdf(m, n, si.wi, sampler.next_1d(), sampler.next_2d())
+        pdf = brdf.brdf_pdf(m, n, si.wi, wo)
         go_on &= pdf > 0
-        beta *= dr.select(go_on, brdf.evaluate(m, n, si.wi, wo) / dr.select(go_on, pdf, 1), 0)
+        beta *= dr.select(go_on, brdf.evaluate_brdf(m, n, si.wi, wo) / dr.select(go_on, pdf, 1), 0)
         ray = si.spawn_ray(si.to_world(wo))
         previous = mi.Interaction3f(si)
         previous_pdf = pdf

@@ -20,7 +20,7 @@ import numpy as np
 
 from relit.geometry.tangents import vertex_tangents
 from relit.lighting.environment import Environment
-from relit.materials.brdf import Surface, evaluate, pdf, sample
+from relit.materials.brdf import Surface, brdf_pdf, evaluate_brdf, sample_brdf
 from relit.reference.mitsuba_scene import build_geometry
 from relit.reference.path import SmoothOrigins
 from relit.rendering.blocks import block_sums, repeat
@@ -149,9 +149,9 @@ def sample_lights(
         n, v = dr.gather(mi.Vector3f, points.n, point), dr.gather(mi.Vector3f, points.v, point)
         m = surface_at(surface, point)
         l_light, _ = environment.sample(mi.Point2f(u[0], u[1]))
-        l_brdf = sample(m, n, v, u[2], mi.Point2f(u[0], u[1]))
+        l_brdf = sample_brdf(m, n, v, u[2], mi.Point2f(u[0], u[1]))
         l = dr.select(from_light, l_light, l_brdf)
-        density = 0.5 * environment.pdf(l) + 0.5 * pdf(m, n, v, l)
+        density = 0.5 * environment.pdf(l) + 0.5 * brdf_pdf(m, n, v, l)
         useful = (dr.dot(n, l) > 0) & dr.gather(mi.Bool, points.valid, point)
         weight = dr.select(useful, 1 / (count * dr.maximum(density, 1e-6)), 0)
         g = dr.gather(mi.Vector3f, points.geometric, point)
@@ -195,7 +195,7 @@ def reflected(points: Points, lights: Lights, surface: Surface, environment: Env
     )
     m = Surface(*material, surface.f0)
     arriving = environment.eval(lights.l) * lights.visible + lights.blocked
-    value = evaluate(m, n, v, lights.l) * arriving * (2 * lights.weight)
+    value = evaluate_brdf(m, n, v, lights.l) * arriving * (2 * lights.weight)
     odd = (dr.arange(mi.UInt32, dr.width(lights.weight)) & 1) == 1
     zero = mi.Color3f(0)
     first, second = dr.select(odd, zero, value), dr.select(odd, value, zero)

@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from relit.lighting.flash import incident
 from relit.materials.plastic_field import PlasticField, plastic_at
-from relit.materials.rough_plastic import Coat, evaluate, pdf, sample
+from relit.materials.rough_plastic import Coat, evaluate_plastic, plastic_pdf, sample_plastic
 from relit.rendering.transport import OFFSET, Points, TraceableMesh, bent_normal, first_hits
 
 # cosine of a light's direction over the flat triangle below which a point lies in its own shadow
@@ -40,7 +40,7 @@ def direct(points: Points, plastic, coat: Coat, n, position, intensity, seen):
     """Eq. (2), first term: Color3f. n: Vector3f, the normal to shade with. seen: Float, f_v.
     Differentiable in all but the points."""
     l, inverse = incident(position, points.x)
-    return evaluate(plastic, coat, n, points.v, l) * (inverse * intensity * seen)
+    return evaluate_plastic(plastic, coat, n, points.v, l) * (inverse * intensity * seen)
 
 
 def indirect(
@@ -67,14 +67,14 @@ def indirect(
         flash = dr.detach(mi.Vector3f(position))
         at_first = dr.detach(plastic)
         n_first = dr.detach(n)
-        l_first = sample(
+        l_first = sample_plastic(
             at_first,
             n_first,
             points.v,
             rng.next_float32(),
             mi.Point2f(rng.next_float32(), rng.next_float32()),
         )
-        density = pdf(at_first, n_first, points.v, l_first)
+        density = plastic_pdf(at_first, n_first, points.v, l_first)
         active = points.valid & (density > 1e-6) & (dr.dot(n_first, l_first) > 0)
         throughput, arriving = mi.Color3f(1), mi.Color3f(0)
         here, l, more = points, l_first, active
@@ -87,19 +87,19 @@ def indirect(
             value = direct(hit, m, coat, bent, flash, dr.detach(intensity), seen)
             arriving += dr.select(more, throughput * value, 0)
             if bounce + 1 < bounces:
-                l = sample(
+                l = sample_plastic(
                     m,
                     bent,
                     hit.v,
                     rng.next_float32(),
                     mi.Point2f(rng.next_float32(), rng.next_float32()),
                 )
-                p = pdf(m, bent, hit.v, l)
+                p = plastic_pdf(m, bent, hit.v, l)
                 more = more & (p > 1e-6)
                 throughput *= dr.select(
-                    more, evaluate(m, coat, bent, hit.v, l) / dr.maximum(p, 1e-6), 0
+                    more, evaluate_plastic(m, coat, bent, hit.v, l) / dr.maximum(p, 1e-6), 0
                 )
                 here = hit
         weight = dr.select(active, dr.rcp(dr.maximum(density, 1e-6)), 0)
         dr.eval(arriving, weight, l_first, rng)
-    return evaluate(plastic, coat, n, points.v, l_first) * (arriving * weight)
+    return evaluate_plastic(plastic, coat, n, points.v, l_first) * (arriving * weight)

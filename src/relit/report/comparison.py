@@ -10,13 +10,13 @@ import numpy as np
 
 from relit.conventions import linear_from_srgb
 from relit.evaluate.metrics import encode, psnr
-from relit.evaluate.photos import shrunk
+from relit.evaluate.photos import shrunk_to_camera
 from relit.reference.photographed import as_photographed
 from relit.scene import Asset, Camera, Capture, Pixels
 
 
 @dataclass(frozen=True)
-class Pair:
+class PhotoAndRender:
     """photo: (H, W, 3) linear, multiplied with its mask where the render has no background to
     compare. render: (H, W, 4) premultiplied.
     where: (H, W) bool, the pixels that `caption` gives the PSNR of."""
@@ -64,7 +64,7 @@ SHOWN = {
 
 def pairs(
     asset: Asset, capture: Capture, *, views: int, held_out: int, side: int, spp: int
-) -> Iterator[Pair]:
+) -> Iterator[PhotoAndRender]:
     """At most `views` photos of the fit and `held_out` ones that it has not seen, evenly spread, at
     most `side` pixels a side."""
     photos = {p.name: p for p in (*capture.photos, *capture.held_out)}
@@ -75,7 +75,7 @@ def pairs(
         *((n, c, "") for n, c in chosen),
         *((n, c, " (held out)") for n, c in unseen),
     ):
-        pixels, small = photos[name].load(), fitted(camera, side)
+        pixels, small = photos[name].load(), shrunk_camera(camera, side)
         photo, render = resized(pixels.rgb, small), show(name, small, spp=spp)
         where, over = render[..., 3] > 0.5, "where the object is drawn"
         if kind == "duplicates":
@@ -87,7 +87,7 @@ def pairs(
             if where.any()
             else "the object is not in view"
         )
-        yield Pair(photo, render, where, f"{name}{tail}: {quality}")
+        yield PhotoAndRender(photo, render, where, f"{name}{tail}: {quality}")
 
 
 def choice(asset: Asset, capture: Capture, views: int, held_out: int) -> tuple[list, list]:
@@ -100,7 +100,9 @@ def choice(asset: Asset, capture: Capture, views: int, held_out: int) -> tuple[l
     unseen = [c for c in known if c[0] in aside]
     if not asset.lights:
         unseen += [(p.name, p.camera) for p in capture.held_out if p.camera is not None]
-    return spread([c for c in known if c[0] not in aside], views), spread(unseen, held_out)
+    return evenly_spread([c for c in known if c[0] not in aside], views), evenly_spread(
+        unseen, held_out
+    )
 
 
 def registered_pixels(
@@ -123,7 +125,7 @@ def registered_pixels(
     ), f"over the photo's pixels of objects, where something is drawn ({count} are registered)"
 
 
-def spread(items, count: int) -> list:
+def evenly_spread(items, count: int) -> list:
     """At most `count` items, evenly spread."""
     items = list(items)
     return (
@@ -133,7 +135,7 @@ def spread(items, count: int) -> list:
     )
 
 
-def fitted(camera: Camera, side: int) -> Camera:
+def shrunk_camera(camera: Camera, side: int) -> Camera:
     """The camera of a picture of at most `side` pixels a side."""
     k = side / max(camera.width, camera.height)
     return (
@@ -145,4 +147,4 @@ def fitted(camera: Camera, side: int) -> Camera:
 
 def resized(image: np.ndarray, camera: Camera) -> np.ndarray:
     """A linear picture at the size of `camera`, by the mean over areas."""
-    return shrunk(np.ascontiguousarray(image, dtype=np.float32), camera)
+    return shrunk_to_camera(np.ascontiguousarray(image, dtype=np.float32), camera)

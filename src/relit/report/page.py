@@ -21,8 +21,8 @@ from relit.log import readable_bytes, readable_seconds
 from relit.reference.flash_scene import build_flash_scene, render_maps
 from relit.reference.mitsuba_scene import build_scene, render, render_channels
 from relit.reference.photographed import lit_scene
-from relit.relight import orbit, seen_from
-from relit.report.comparison import SHOWN, TITLES, fitted, kind_of, pairs, spread
+from relit.relight import orbit, orbit_camera
+from relit.report.comparison import SHOWN, TITLES, evenly_spread, kind_of, pairs, shrunk_camera
 from relit.report.curves import ball_of, bars, camera_plot, curve
 from relit.run import read_metrics, read_stages
 from relit.scene import Asset, Capture
@@ -122,10 +122,10 @@ def _channels(asset: Asset) -> str:
         if flash
         else lit_scene(asset, ground=False)
     )
-    for name, camera in spread(asset.cameras, 3)[
+    for name, camera in evenly_spread(asset.cameras, 3)[
         :2
     ]:  # the first and the middle one: the last often stands beside the first
-        small = fitted(camera, SIDE)
+        small = shrunk_camera(camera, SIDE)
         c = render_maps(scene, small) if flash else render_channels(scene, small, spp=16)
         a = c["coverage" if flash else "alpha"][..., None]
         if flash:
@@ -174,7 +174,7 @@ def _light(asset: Asset) -> str:
     ]
     cells = "".join(_figure(_scaled(e * k, 480), text) for k, text in shown)
     peak = f"Mean {level:.3g}, largest {float(e.max()):.3g}, in units of the photos' linear pixels. Middle of the picture: +Z, top: +Y."
-    own = spread(
+    own = evenly_spread(
         [(name, light) for (name, _), light in zip(asset.cameras, asset.lights, strict=False)],
         VIEWS,
     )
@@ -195,7 +195,7 @@ def _light(asset: Asset) -> str:
 def _turntables(asset: Asset) -> str:
     cameras = [camera for _, camera in orbit(asset, STILLS, SIDE)]
     cameras += [
-        seen_from(asset, 0, elevation, SIDE) for elevation in (90, -90)
+        orbit_camera(asset, 0, elevation, SIDE) for elevation in (90, -90)
     ]  # the side below is often a guess, and easily overlooked
     cells = []
     lights = {"a studio of formulas": studio(64), "an evening of formulas": evening(64)}

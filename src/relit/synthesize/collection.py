@@ -61,7 +61,7 @@ SCALE_VIEWS = 8
 
 
 @dataclass(frozen=True)
-class Shot:
+class PhotoPlan:
     """One photo before it is taken. light: index of the HDRI, yaw: share of a turn. level, white:
     see LEVEL, WHITE_BALANCE."""
 
@@ -228,7 +228,9 @@ def settings_of(
 # ---------------------------------------------------------------- where the cameras stand
 
 
-def plan_shots(views: int, test_views: int, resolution: int, lights: int, seed: int) -> list[Shot]:
+def plan_shots(
+    views: int, test_views: int, resolution: int, lights: int, seed: int
+) -> list[PhotoPlan]:
     """All photos; test photos are spread evenly among the others."""
     rng, count = np.random.default_rng(seed), views + test_views
     order = rng.permutation(count)  # neighbours on the spiral are not neighbours in name
@@ -255,7 +257,7 @@ def plan_shots(views: int, test_views: int, resolution: int, lights: int, seed: 
         white = np.exp(rng.normal(size=3) * WHITE_BALANCE * np.array([1, 0, 1]))
         camera = Camera(w, h, focal, focal, w / 2, h / 2, pose)
         shots.append(
-            Shot(
+            PhotoPlan(
                 f"{i:03d}",
                 camera,
                 int(rng.integers(lights)),
@@ -273,7 +275,7 @@ def plan_shots(views: int, test_views: int, resolution: int, lights: int, seed: 
 
 def take(
     out: Path,
-    shot: Shot,
+    shot: PhotoPlan,
     mesh,
     material,
     world_from_asset,

@@ -31,7 +31,7 @@ from relit.scene import Camera, Ground, Mesh
 from relit.synthesize.multiview import (
     RADIUS,
     claim_folder,
-    exposure,
+    exposure_factor,
     identity_of,
     object_frame,
     overridden,
@@ -115,7 +115,9 @@ def synthesize_duplicates(
     def lit(file: Path):
         environment = read_image(file).rgb
         scene = build_scene(pile.mesh, pile.material, np.eye(4), environment)
-        environment = (environment * exposure(scene, [("", camera)], max_depth)).astype(np.float32)
+        environment = (environment * exposure_factor(scene, [("", camera)], max_depth)).astype(
+            np.float32
+        )
         return build_scene(pile.mesh, pile.material, np.eye(4), environment), environment
 
     scene, environment = lit(light_file)
@@ -250,7 +252,7 @@ def heap(
     rng = np.random.default_rng(seed)
     frame = object_frame(mesh, RADIUS)
     points = surface_points(move_points(frame, mesh.vertices), mesh.faces, rng)
-    hull = Hull(points)
+    hull = RestingHull(points)
     radius = spread * RADIUS * np.sqrt(0.9 * count)
     side = int(np.ceil((radius + 2 * RADIUS) / CELL)) * 2 + 1
     height = np.zeros((side, side))
@@ -295,7 +297,7 @@ def surface_points(vertices: np.ndarray, faces: np.ndarray, rng, count: int = 60
     return np.concatenate([vertices, a[f] + u * (b - a)[f] + v * (c - a)[f]])
 
 
-class Hull:
+class RestingHull:
     """The convex hull of points, for the facets that a body comes to rest on. The centre of mass is
     the mean of the surface points."""
 

@@ -127,7 +127,7 @@ def synthesize_flash(
     write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
     flash = Flash(
         np.array(offset, np.float64),
-        np.full(3, exposure(scene, train, np.array(offset, np.float64), max_depth)),
+        np.full(3, flash_intensity_for(scene, train, np.array(offset, np.float64), max_depth)),
     )
     write_text(out / "light.txt", f"{flash.intensity[0]:.8g}\n")
     write_text(
@@ -252,7 +252,7 @@ def slow_wave(mesh: Mesh, shape: tuple[int, int]) -> np.ndarray:
 # ---------------------------------------------------------------- pictures and files
 
 
-def exposure(
+def flash_intensity_for(
     scene, cameras: Sequence[tuple[str, Camera]], offset: np.ndarray, max_depth: int
 ) -> float:
     """The intensity that puts the 95th percentile, over the object's pixels in 6 small views, of

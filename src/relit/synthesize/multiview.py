@@ -120,7 +120,7 @@ def synthesize_multiview(
         """Scene under a light whose exposure fits the object, and that light."""
         environment = read_image(file).rgb
         scene = build_scene(mesh, material, world_from_asset, environment, bsdf=truth_bsdf)
-        environment = (environment * exposure(scene, train, max_depth)).astype(np.float32)
+        environment = (environment * exposure_factor(scene, train, max_depth)).astype(np.float32)
         return build_scene(
             mesh, material, world_from_asset, environment, bsdf=truth_bsdf
         ), environment
@@ -235,7 +235,7 @@ def radiance(scene, camera: Camera, spp: int, max_depth: int, seed: int) -> np.n
     return render(scene, camera, spp=spp, seed=seed, max_depth=max_depth)
 
 
-def exposure(scene, cameras: Sequence[tuple[str, Camera]], max_depth: int) -> float:
+def exposure_factor(scene, cameras: Sequence[tuple[str, Camera]], max_depth: int) -> float:
     """Factor on the light that puts the 99th percentile, over the object's pixels in 8 small views,
     of the brightest channel at WHITE."""
     values = []

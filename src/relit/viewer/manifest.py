@@ -8,11 +8,10 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from relit.asset.asset import find_asset, read_cameras, read_json
+from relit.asset.asset import find_asset, read_bounded_json, read_cameras
 from relit.conventions import world_from_gl_camera
 from relit.errors import UserError
-from relit.files import parse_toml
-from relit.files import read_json as read_small_json
+from relit.files import parse_toml, read_json
 from relit.log import readable_seconds
 from relit.run import read_metrics, read_stages
 from relit.scene import Camera
@@ -35,7 +34,7 @@ def manifest(run: Path, address: Address, *, live: bool, photos: bool = True) ->
     if asset is None and not (run / "config.toml").is_file():
         find_asset(run)  # says what was looked for
     config = _config(run)
-    found = {} if asset is None else read_json(asset / "asset.json")
+    found = {} if asset is None else read_bounded_json(asset / "asset.json")
     facts = [
         str(v)
         for v in (
@@ -82,7 +81,7 @@ def manifest(run: Path, address: Address, *, live: bool, photos: bool = True) ->
             }
         )
     out["lights"] = _lights(asset, cameras, address)
-    flash = read_small_json(asset / "lights" / "flash.json")
+    flash = read_json(asset / "lights" / "flash.json")
     if isinstance(flash, dict) and {"offset", "intensity"} <= flash.keys():
         out["flash"] = {"offset": flash["offset"], "intensity": flash["intensity"]}
     return out
@@ -90,7 +89,7 @@ def manifest(run: Path, address: Address, *, live: bool, photos: bool = True) ->
 
 def photo_files(run: Path) -> dict[str, Path]:
     """{name of a photo: its small copy in the run folder}."""
-    index = read_small_json(run / PHOTOS / "index.json")
+    index = read_json(run / PHOTOS / "index.json")
     files = index.get("photos", {}) if isinstance(index, dict) else {}
     paths = {name: run / PHOTOS / Path(str(file)).name for name, file in files.items()}
     return {name: path for name, path in paths.items() if path.is_file()}
@@ -150,7 +149,7 @@ def _lights(asset: Path, cameras, address: Address) -> list[dict]:
 
 
 def _instances(asset: Path) -> list:
-    data = read_small_json(asset / "instances.json")
+    data = read_json(asset / "instances.json")
     listed = data.get("instances", []) if isinstance(data, dict) else []
     poses = [
         i.get("world_from_object")

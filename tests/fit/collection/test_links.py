@@ -64,14 +64,16 @@ def test_photos_of_one_ball_are_linked_whatever_their_light(tmp_path):
 
 
 def shots_of(count, step=40.0, side=64, field=1.1):
-    from relit.fit.collection.photos import Shot
+    from relit.fit.collection.photos import CollectionPhoto
     from relit.scene import Camera, Photo
 
     out, poses = [], []
     for i, d in enumerate(arc(count, step)):
         rgb, mask, pose, f = texture_ball(d, side, field)
         camera = Camera(side, side, f, f, side / 2, side / 2, np.eye(4))
-        out.append(Shot(Photo(f"{i}.png", None, side, side), rgb, mask, camera, np.zeros(3)))
+        out.append(
+            CollectionPhoto(Photo(f"{i}.png", None, side, side), rgb, mask, camera, np.zeros(3))
+        )
         poses.append(pose)
     return out, np.array(poses)
 
@@ -89,14 +91,14 @@ def turned(poses, rng, scale=3.0):
 
 def test_a_group_is_put_into_the_hints_frame():
     from relit.cameras.links import Group
-    from relit.fit.collection.links import placed
+    from relit.fit.collection.links import poses_of_group
     from relit.geometry.se3 import rotation_angle
 
     shots, poses = shots_of(8)
     other, _ = turned(poses, np.random.default_rng(3))
     group = Group(np.arange(8), other, np.full(8, 1.1), np.zeros((0, 3)), np.zeros(0, int))
     hints = poses[:, :3, 3] / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
-    found, angle = placed(group, shots, hints)
+    found, angle = poses_of_group(group, shots, hints)
     assert angle < 5
     assert (
         max(rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(found, poses, strict=True)) < 6
@@ -178,7 +180,7 @@ def test_from_how_many_linked_photos_a_shape_begins(monkeypatch, photos, linked,
         asked.append(True)
         raise UserError("far enough")
 
-    monkeypatch.setattr(links, "placed", placed)
+    monkeypatch.setattr(links, "poses_of_group", placed)
     group = Group(
         np.arange(linked),
         np.tile(np.eye(4), (linked, 1, 1)),
@@ -209,7 +211,7 @@ def spoilt(shots, which):
 def test_one_bad_mask_does_not_unlink_few_photos(bad):
     from relit.cameras.links import Group
     from relit.fit.collection.links import poses_from_links
-    from relit.fit.collection.photos import crops_of
+    from relit.fit.collection.photos import collection_crops
     from relit.geometry.se3 import camera_errors
 
     shots, poses = shots_of(6, 6.0, 120, 0.45)
@@ -218,7 +220,7 @@ def test_one_bad_mask_does_not_unlink_few_photos(bad):
     group = Group(np.arange(6), other, np.full(6, 0.45), np.zeros((0, 3)), np.zeros(0, int))
     said = []
     found, scores, held = poses_from_links(
-        crops_of(shots), [group], shots, np.zeros((6, 3)), 45.0, 1, 0, said.append
+        collection_crops(shots), [group], shots, np.zeros((6, 3)), 45.0, 1, 0, said.append
     )
     assert held.all() and camera_errors(found, poses)[0].max() < 1
     named = [line for line in said if "look at its mask" in line]
@@ -231,7 +233,7 @@ def test_given_cameras_begin_the_shape_like_matches(monkeypatch):
     """They are not matched again, and bring every photo to its place; one photo without a camera,
     and matches are asked."""
     from relit.fit.collection import links
-    from relit.fit.collection.photos import crops_of
+    from relit.fit.collection.photos import collection_crops
     from relit.geometry.se3 import camera_errors
 
     shots, poses = shots_of(8)
@@ -240,7 +242,7 @@ def test_given_cameras_begin_the_shape_like_matches(monkeypatch):
     groups = links.links_stage(given, None, 0)
     assert len(groups) == 1 and np.allclose(groups[0].focals, 1.1)
     found, scores, held = links.poses_from_links(
-        crops_of(given), groups, given, np.zeros((8, 3)), 45.0, 1, 0, lambda *_: None
+        collection_crops(given), groups, given, np.zeros((8, 3)), 45.0, 1, 0, lambda *_: None
     )
     assert held.all() and camera_errors(found, poses)[0].max() < 1 and scores.mean() > 0.9
 

@@ -25,7 +25,7 @@ def photos(lump):
 
 def fitted(photos, **options):
     """The mesh that the volume pass makes of the photos."""
-    from relit.fit.collection.shape import hull_of
+    from relit.fit.collection.shape import tolerant_hull
     from relit.fit.passes.optimiser import NoStage
     from relit.fit.passes.pixels import make_bank
     from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
@@ -36,7 +36,10 @@ def fitted(photos, **options):
     rgb, masks, cameras = zip(*photos, strict=True)
     tints = np.array([r[m > 0.9].mean(0) for r, m in zip(rgb, masks, strict=True)])
     model = start_model(
-        hull_of(list(cameras), list(masks), LEVELS["levels"][0]), np.full(3, 0.3), None, full=False
+        tolerant_hull(list(cameras), list(masks), LEVELS["levels"][0]),
+        np.full(3, 0.3),
+        None,
+        full=False,
     )
     model.reflections, model.rates = start_photo_lights(tints, 0.3)
     model.appearance = shade_photos

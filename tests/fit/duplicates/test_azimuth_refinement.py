@@ -11,7 +11,7 @@ from relit.fit.duplicates import azimuth_refinement as module
 from relit.fit.duplicates import recipe as duplicates
 from relit.fit.duplicates.azimuth_refinement import turned_as_shown
 from relit.fit.registration.instances.azimuth import turned_by
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.se3 import look_at, rotation_angle
 from relit.reference.photographed import as_photographed
 from relit.run import Run
@@ -51,7 +51,7 @@ def photographed():
     )
     picture = as_photographed(asset)("photo", camera, spp=64)
     own = as_photographed(replace(asset, instances=instances[1:]))("photo", camera, spp=16)[..., 3]
-    view = View(
+    view = InstanceView(
         7,
         camera.with_pose(np.eye(4)),
         picture[..., :3],
@@ -66,7 +66,7 @@ def photographed():
 def test_the_turn_that_looks_like_the_photo_is_found(photographed, angle):
     asset, camera, view, pose = photographed
     guess = turned_by(pose, AXIS, angle)
-    begun = module.moved(asset, {7: np.linalg.inv(guess) @ pose})
+    begun = module.with_instances_moved(asset, {7: np.linalg.inv(guess) @ pose})
     seen = []
     found = turned_as_shown(begun, [view], [camera], guess[None], AXIS, progress=seen.append)
     assert rotation_angle(found[0][:3, :3] @ pose[:3, :3].T) < 3.0
@@ -82,7 +82,7 @@ def test_only_guessed_instances_are_turned_and_a_rerun_reads_them_back(
 ):
     asset, camera, view, pose = photographed
     guess = turned_by(pose, AXIS, 2.5)
-    begun = module.moved(asset, {7: np.linalg.inv(guess) @ pose})
+    begun = module.with_instances_moved(asset, {7: np.linalg.inv(guess) @ pose})
     other = np.linalg.inv(asset.instances[0].world_from_object)
     parts = {
         "poses": np.array([other, guess]) @ camera.world_from_camera,
@@ -116,7 +116,7 @@ def test_where_two_turns_look_alike_the_one_it_has_stays(photographed, angle):
     )
     picture = as_photographed(alike)("photo", camera, spp=64)[..., :3]
     guess = turned_by(pose, AXIS, angle)
-    begun = module.moved(alike, {7: np.linalg.inv(guess) @ pose})
+    begun = module.with_instances_moved(alike, {7: np.linalg.inv(guess) @ pose})
     found = turned_as_shown(
         begun, [replace(view, rgb=picture * 0.9)], [camera], guess[None], AXIS
     )  # a light that is somewhat off

@@ -27,7 +27,7 @@ from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import RayBatch
 from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
 from relit.fit.registration.instances.views import carved, pixel_bank, views_of
-from relit.fit.shape.outlines import trace
+from relit.fit.shape.outlines import trace_rays
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import exp_so3
@@ -65,9 +65,9 @@ def views_of_mesh(mesh: Mesh, angles) -> tuple[list, np.ndarray]:
     x, y = (a.ravel() + 0.5 for a in np.meshgrid(np.arange(SIDE), np.arange(SIDE)))
     views, poses = [], around(angles)
     for k, pose in enumerate(poses):
-        mask = np.isfinite(trace(build_geometry(mesh), camera.with_pose(pose), x, y)[0]).reshape(
-            SIDE, SIDE
-        )
+        mask = np.isfinite(
+            trace_rays(build_geometry(mesh), camera.with_pose(pose), x, y)[0]
+        ).reshape(SIDE, SIDE)
         views += views_of(
             np.repeat(0.4 * mask[..., None], 3, -1).astype(np.float32),
             mask.astype(np.int32) * (k + 1),

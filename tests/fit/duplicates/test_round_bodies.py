@@ -9,7 +9,7 @@ import numpy as np
 
 from relit.fit.duplicates.options import DuplicatesOptions
 from relit.fit.duplicates.round_bodies import made_round
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import node_positions, redistance
 from support.outlined_ball import coverage, looking_at_origin
@@ -36,7 +36,9 @@ def asked(mesh, truth, **changes):
         camera = looking_at_origin(side)
         mask = coverage(truth, camera)
         views.append(
-            View(k, camera, np.repeat(mask[..., None], 3, -1) * 0.5, mask, np.ones_like(mask), 1.0)
+            InstanceView(
+                k, camera, np.repeat(mask[..., None], 3, -1) * 0.5, mask, np.ones_like(mask), 1.0
+            )
         )
         poses.append(camera.world_from_camera)
     return made_round(

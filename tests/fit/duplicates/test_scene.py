@@ -130,7 +130,7 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
     import drjit as dr
     import mitsuba as mi
 
-    from relit.fit.duplicates.scene import alone_bank, scene_mesh, spread
+    from relit.fit.duplicates.scene import alone_bank, scene_mesh, spread_moves
     from relit.fit.passes.pixels import batch_of
     from relit.lighting.environment import Environment
     from relit.materials.brdf import Surface
@@ -157,7 +157,7 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
         "plane": np.stack([[0, 0.7, 8.0], [0, -1.0, 0]]),
     }
     place = similarity(np.eye(3), np.array([0, 0, -8.7]))
-    moves = spread(standing, place)
+    moves = spread_moves(standing, place)
     own = camera.with_pose(place)
     whole, radiance = scene_mesh(mesh, parts, standing, place, pixels, camera, moves)
     assert whole.vertices.shape == (6 * len(mesh.vertices), 3) and (whole.uvs >= 0).all()

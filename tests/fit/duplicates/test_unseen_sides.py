@@ -13,7 +13,7 @@ from relit.fit.duplicates.unseen_sides import (
     seen_in,
     told_at,
 )
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh, face_areas
 from relit.geometry.sdf import node_positions, redistance
@@ -69,7 +69,7 @@ def scene_of(body, eyes):
         camera = Camera(SIDE, SIDE, 260.0, 260.0, SIDE / 2, SIDE / 2, look_at(eye))
         mask = mask_of(scene, camera)
         views.append(
-            View(
+            InstanceView(
                 k + 1,
                 camera.with_pose(np.eye(4)),
                 np.ones((SIDE, SIDE, 3), np.float32),
@@ -168,7 +168,8 @@ def test_who_sees_what():
     assert seen[height > 0.2].all()
     assert not seen[height < -0.3].any()
     blind = [
-        View(v.label, v.camera, v.rgb, np.zeros_like(v.mask), v.known, v.seen) for v in views
+        InstanceView(v.label, v.camera, v.rgb, np.zeros_like(v.mask), v.known, v.seen)
+        for v in views
     ]  # something else is in front
     assert not seen_in(mesh, blind, poses).any()
     assert 0.4 < areas[seen].sum() / areas.sum() < 0.75

@@ -15,7 +15,7 @@ from relit.fit.duplicates.poses import all_views
 from relit.fit.duplicates.vessel_trial import FLOORS, lowest_of
 from relit.fit.duplicates.vessels import End, body_axis, ends_of, floor_under, hollowed, mouths
 from relit.fit.passes.surface import SurfaceOptions
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.hull import distance_of
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.revolution_axis import Axis, revolution_axis
@@ -52,7 +52,7 @@ def silhouettes(values, heights=(1.2, 1.6, 2.2, -1.4, -2.0)):
         q = c.project(node_positions(160)[values].astype(float))
         cover[np.clip(q[:, 1].astype(int), 0, 95), np.clip(q[:, 0].astype(int), 0, 95)] = 1
         cameras.append(c)
-        views.append(View(k, c, np.zeros((96, 96, 3)), cover, np.ones((96, 96)), 1.0))
+        views.append(InstanceView(k, c, np.zeros((96, 96, 3)), cover, np.ones((96, 96)), 1.0))
     return views, cameras
 
 
@@ -253,7 +253,7 @@ def test_the_second_end_is_asked_of_the_fit_with_the_first_hollow(monkeypatch):
         monkeypatch.setattr(vessel_trial, name, by)
     names = iter(["flat", "mouth 0.0", "mouth 0.2", "mouth 0.4", "foot 0.0"])
     monkeypatch.setattr(
-        vessel_trial.Body, "of", staticmethod(lambda *_: Fake(mesh=None, name=next(names)))
+        vessel_trial.TrialShape, "of", staticmethod(lambda *_: Fake(mesh=None, name=next(names)))
     )
     said = []
     found = vessel_trial.vessel_of(

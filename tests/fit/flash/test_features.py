@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from relit.fit.flash.dino import DinoNetwork
-from relit.fit.flash.features import FlashView, capture_features, network_features, seen_from
+from relit.fit.flash.features import FlashView, capture_features, flash_views_of, network_features
 from relit.fit.flash.lobe_clusters import (
     LADDER,
     SCALES,
@@ -57,7 +57,7 @@ def test_places_behind_the_ball_are_not_seen(shot, places):
     bank, views, mesh, _ = shot
     x, n, _ = places
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
-    seen = seen_from(bank, views[3], 3, mesh, point, normal, FLASH)
+    seen = flash_views_of(bank, views[3], 3, mesh, point, normal, FLASH)
     facing = (n * (views[3].centre - x)).sum(1) > 0
     assert not np.array(seen.ok)[~facing].any() and np.array(seen.ok)[facing].mean() > 0.7
     u, v, _ = views[3].project(x).T

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from relit.fit.flash.ambient import find_ambient
-from relit.fit.flash.features import FlashView, capture_features, seen_from
+from relit.fit.flash.features import FlashView, capture_features, flash_views_of
 from relit.fit.passes.pixels import batch_of, make_bank
 from relit.geometry.se3 import look_at
 from relit.lighting.flash import light_position
@@ -253,7 +253,7 @@ def test_a_flash_that_throws_no_shadow_throws_none_anywhere(scene):
     for lit_only in (False, True):
         dark, bright = (
             np.array(
-                seen_from(
+                flash_views_of(
                     bank, camera, 0, traceable, x, n, FlashView(offset, 1.0, shadow), lit_only
                 ).ok
             )

@@ -10,7 +10,7 @@ from relit.fit.flash.lobe_clusters import best_lobes, start_kinship
 from relit.fit.flash.surface import (
     FlashModel,
     FlashSurfaceOptions,
-    brightness,
+    brightest_albedo,
     calm_weights,
     fit_flash_surface,
     offset_of,
@@ -195,7 +195,7 @@ def test_even_pixels_count_more_than_edges(shot):
 
 def test_common_scale_is_restored_and_direct_light_stays(shot):
     bank, _, mesh, field = shot
-    brightest = brightness(field)
+    brightest = brightest_albedo(field)
     batch = batch_of(bank, dr.arange(mi.UInt32, 0, bank.total, 11))
     points = first_hits(mesh, batch.o, batch.d)
     dr.eval(points, batch.view)
@@ -212,7 +212,7 @@ def test_common_scale_is_restored_and_direct_light_stays(shot):
     model = FlashModel(darker, None, None, mi.Vector3f(0), mi.Float([1.0]), Coat())
     before = picture(model)
     rescale(model, brightest)
-    assert brightness(model.field) == pytest.approx(brightest, rel=1e-5)
+    assert brightest_albedo(model.field) == pytest.approx(brightest, rel=1e-5)
     assert float(model.log_intensity[0]) == pytest.approx(1 + np.log(0.8), abs=1e-5)
     np.testing.assert_allclose(picture(model), before, rtol=1e-4, atol=1e-6)
 

@@ -126,7 +126,7 @@ def test_a_ball_comes_back(capture_folder, tmp_path):
 def test_what_no_photo_shows_is_painted_like_what_is_next_to_it(
     capture_folder, tmp_path, monkeypatch
 ):
-    from relit.fit.multiview.recipe import recipe as multiview
+    from relit.fit.multiview import recipe as multiview
 
     whole = open_capture(capture_folder)
     capture = replace(whole, photos=whole.photos[:5])  # from above

@@ -133,7 +133,7 @@ def test_what_is_mirrored_counts_as_reflectance():
 def test_mirrored_is_what_black_paint_reflects_under_even_light(roughness):
     """Over views that stand on the hemisphere by their cosine; directions of the light by mirrors
     drawn from GGX."""
-    from relit.materials.brdf import Surface, evaluate, ggx_d
+    from relit.materials.brdf import Surface, evaluate_brdf, ggx_d
 
     rng = np.random.default_rng(4)
     a, n = roughness**2, 200_000
@@ -148,7 +148,9 @@ def test_mirrored_is_what_black_paint_reflects_under_even_light(roughness):
     density = ggx_d(h.z, a) * h.z / (4 * dr.maximum(dr.dot(v, h), 1e-6))
     black = Surface(mi.Color3f(0.0), mi.Float(roughness), mi.Float(0.0))
     f = dr.select(
-        (l.z > 0) & (dr.dot(v, h) > 0), evaluate(black, mi.Vector3f(0, 0, 1), v, l).x / density, 0
+        (l.z > 0) & (dr.dot(v, h) > 0),
+        evaluate_brdf(black, mi.Vector3f(0, 0, 1), v, l).x / density,
+        0,
     )
     assert np.array(f).mean() == pytest.approx(
         np.array(mirrored(mi.Float(roughness)))[0], abs=0.006

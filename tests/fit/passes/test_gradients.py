@@ -22,7 +22,7 @@ from relit.fit.passes.surface import (
     dual_loss,
     light_prior,
     material_prior,
-    neighbours,
+    neighbour_points,
     parsimony,
     slope_prior,
 )
@@ -188,8 +188,8 @@ class SurfaceScene:
         self.smooth = self.points.n
         self.target = mi.Color3f(*[mi.Float(rng.uniform(0.1, 0.9, SIZE * SIZE)) for _ in range(3)])
         lanes = mi.PCG32(size=SIZE * SIZE, initstate=1)
-        self.near = neighbours(self.mesh, self.points, 0.15, lanes)
-        self.close = neighbours(self.mesh, self.points, 0.05, lanes)
+        self.near = neighbour_points(self.mesh, self.points, 0.15, lanes)
+        self.close = neighbour_points(self.mesh, self.points, 0.05, lanes)
         colour = np.array(self.field.colour).reshape(-1, 4)
         colour[:, 3] = rng.uniform(0.3, 0.7, len(colour))
         if self.options.scale_power == 1:

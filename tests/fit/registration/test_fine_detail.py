@@ -67,12 +67,12 @@ def painted(device):
 
 
 def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
-    from relit.fit.registration.fine_detail import surface_of, told_apart
+    from relit.fit.registration.fine_detail import compare_detail, surface_of
 
     mesh, pictures, truth = painted
     cameras = [turned(c, 180) if i in (3, 7) else c for i, c in enumerate(truth)]
     choices = [(i, turned(c, t)) for i, c in enumerate(cameras) for t in (90, 180, 270)]
-    told = told_apart(surface_of(mesh), pictures, cameras, choices)
+    told = compare_detail(surface_of(mesh), pictures, cameras, choices)
     found = told.moved
     assert set(found) == {3, 7} and not told.as_well
     for i, camera in found.items():
@@ -80,32 +80,36 @@ def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
 
 
 def test_a_new_photo_is_held_against_the_others(painted):
-    from relit.fit.registration.fine_detail import laid_on, surface_of, told_apart
+    from relit.fit.registration.fine_detail import compare_detail, photo_values_at, surface_of
 
     mesh, pictures, truth = painted
     surface = surface_of(mesh)
-    laid = np.array([laid_on(surface, c, p) for c, p in zip(truth[1:], pictures[1:], strict=True)])
+    laid = np.array(
+        [photo_values_at(surface, c, p) for c, p in zip(truth[1:], pictures[1:], strict=True)]
+    )
     wrong = turned(truth[0], 180)
     choices = [(0, turned(truth[0], t)) for t in (0, 90, 270)]
-    assert told_apart(surface, pictures[:1], [wrong], choices, laid).moved == {0: choices[0][1]}
-    assert told_apart(surface, pictures[:1], truth[:1], choices[1:], laid).moved == {}
+    assert compare_detail(surface, pictures[:1], [wrong], choices, laid).moved == {0: choices[0][1]}
+    assert compare_detail(surface, pictures[:1], truth[:1], choices[1:], laid).moved == {}
 
 
 def test_a_plain_ball_tells_nothing(device):
-    from relit.fit.registration.fine_detail import surface_of, told_apart
+    from relit.fit.registration.fine_detail import compare_detail, surface_of
 
     mesh, pictures, cameras = photos(plain=True)
     choices = [(i, turned(c, t)) for i, c in enumerate(cameras) for t in (90, 180, 270)]
-    told = told_apart(surface_of(mesh), pictures, cameras, choices)
+    told = compare_detail(surface_of(mesh), pictures, cameras, choices)
     assert len(told.moved) <= 1 and len(told.as_well) >= 6  # and so it is said
 
 
 def test_likeness_of_poses(painted):
-    from relit.fit.registration.fine_detail import expected, laid_on, likeness, surface_of
+    from relit.fit.registration.fine_detail import expected, likeness, photo_values_at, surface_of
 
     mesh, pictures, cameras = painted
     surface = surface_of(mesh)
-    laid = np.array([laid_on(surface, c, p) for c, p in zip(cameras, pictures, strict=True)])
+    laid = np.array(
+        [photo_values_at(surface, c, p) for c, p in zip(cameras, pictures, strict=True)]
+    )
     side = (np.asarray(mesh.vertices) @ cameras[0].centre) > 0
     assert (
         np.isfinite(laid[0]).sum() > 100 and not np.isfinite(laid[0][~side]).any()
@@ -122,16 +126,16 @@ def test_likeness_of_poses(painted):
 
 
 def test_photos_in_wrong_places_are_not_borne_out(painted):
-    from relit.fit.registration.fine_detail import borne_out, surface_of
+    from relit.fit.registration.fine_detail import detail_correlation, surface_of
 
     mesh, pictures, truth = painted
     surface = surface_of(mesh)
     wrong = [turned(c, 180) if i in (3, 7) else c for i, c in enumerate(truth)]
-    detail = borne_out(surface, pictures, wrong)
+    detail = detail_correlation(surface, pictures, wrong)
     assert detail[[3, 7]].max() < 0.25 < np.delete(detail, [3, 7]).min()
     away = [turned(c, 73 * i) for i, c in enumerate(truth)]
-    assert np.median(borne_out(surface, pictures, away)) < 0.25
-    four = borne_out(surface, pictures[:5], truth[:5])  # a single other photo has to do
+    assert np.median(detail_correlation(surface, pictures, away)) < 0.25
+    four = detail_correlation(surface, pictures[:5], truth[:5])  # a single other photo has to do
     assert np.median(four) > 0.25
 
 

@@ -9,17 +9,22 @@ from relit.conventions import linear_from_srgb, move_points, srgb_from_linear
 from relit.fit.shape import alignment as joint_alignment
 from relit.fit.shape.alignment import (
     EXACT,
+    camera_after_motion,
     follow_views,
-    misfit,
     projection,
+    shift_quantile,
     solved,
     tangents,
     texture_rows,
-    turned,
     with_poses,
 )
-from relit.fit.shape.outlines import follow_with_poses, trace
-from relit.fit.shape.texture_shifts import brightness, neighbours, shares, texture_shifts
+from relit.fit.shape.outlines import follow_with_poses, trace_rays
+from relit.fit.shape.texture_shifts import (
+    display_luminance,
+    flow_weights,
+    neighbouring_views,
+    texture_shifts,
+)
 from relit.geometry.se3 import rotation_angle
 from relit.reference.mitsuba_scene import build_geometry
 from support.painted_lump import astray, camera_at, everywhere, lump, shown
@@ -71,7 +76,7 @@ def test_derivatives_are_those_of_the_projection(seen):
             atol=1e-2,
         )
     for axis in range(6):
-        after = turned(camera, h * np.eye(6)[axis])
+        after = camera_after_motion(camera, h * np.eye(6)[axis])
         np.testing.assert_allclose(
             (after.project(points) - camera.project(points))[:, :2] / h,
             by_motion[..., axis],
@@ -89,11 +94,11 @@ def test_derivatives_are_those_of_the_projection(seen):
 def test_pictures_lie_on_each_other_where_all_is_right(seen):
     mesh, cameras, pictures, masks = seen
     shifts = texture_shifts(mesh, cameras, pictures, masks)
-    pairs = neighbours(cameras)
-    assert {(s.view, s.other) for s in shifts} == set(pairs) and misfit(shifts) < 0.15
+    pairs = neighbouring_views(cameras)
+    assert {(s.view, s.other) for s in shifts} == set(pairs) and shift_quantile(shifts) < 0.15
     assert len(pairs) >= 10 and len({frozenset(pair) for pair in pairs}) == len(pairs)  # each once
     assert len({first for first, _ in pairs}) == len(cameras)  # and each view is looked into
-    assert misfit([]) == 0
+    assert shift_quantile([]) == 0
 
 
 def test_a_pose_is_asked_back_by_the_pixels_that_it_is_off(seen):
@@ -138,7 +143,7 @@ def test_a_mesh_that_is_too_thin_is_told_by_parallax(seen):
     truth, flow, told = [], [], []
     for s, x, y in zip(shifts, rows[::2], rows[1::2], strict=True):
         other = cameras[s.other]
-        far = trace(scene, other, *other.project(s.point)[:, :2].T)[0]
+        far = trace_rays(scene, other, *other.project(s.point)[:, :2].T)[0]
         ray = s.point - other.centre
         met = other.centre + ray * (far / np.linalg.norm(ray, axis=1))[:, None]
         use = np.isfinite(far) & (x.trust > 0)
@@ -172,9 +177,9 @@ def test_labels_that_mislead_are_outvoted_by_textures(seen):
     wrong = [np.roll(m, (dy, dx), (0, 1)) for m, (dx, dy) in zip(masks, ways, strict=True)]
     _, alone = follow_with_poses(mesh, cameras, wrong, everywhere(masks), 5)
     found, poses, off = follow_views(mesh, cameras, pictures, wrong, everywhere(masks), 5)
-    assert misfit(texture_shifts(mesh, with_poses(cameras, alone), pictures, wrong)) > EXACT
+    assert shift_quantile(texture_shifts(mesh, with_poses(cameras, alone), pictures, wrong)) > EXACT
     assert (
-        misfit(texture_shifts(found, with_poses(cameras, poses), pictures, wrong)) < EXACT
+        shift_quantile(texture_shifts(found, with_poses(cameras, poses), pictures, wrong)) < EXACT
         and off[1] < EXACT < off[0]
     )
     assert apart(poses, cameras, mesh) < 0.5 * apart(alone, cameras, mesh)
@@ -223,7 +228,7 @@ def test_colour_tells_where_brightness_does_not(seen):
                 np.float32
             )
         )
-    assert np.ptp(brightness(even[0])) < 1e-5
+    assert np.ptp(display_luminance(even[0])) < 1e-5
     wrong = [astray(cameras[:1], 2.0, seed=4)[0], *cameras[1:]]
     shifts = texture_shifts(mesh, wrong, even, masks)
     mine = [s for s in shifts if s.view == 0]
@@ -245,11 +250,11 @@ def test_places_count_by_their_structure(seen):
         structure=np.where(clear, 0.1, 0.01),
         shift=np.where(clear[:, None], [[1.0, 0.0]], [[0.0, 9.0]]),
     )
-    (share,) = shares([some])
+    (share,) = flow_weights([some])
     assert share[clear].min() > 50 * share[~clear].max() and np.average(
         share, weights=share
     ) == pytest.approx(1.0)
-    assert misfit([some]) == 1.0
+    assert shift_quantile([some]) == 1.0
 
 
 def test_a_shape_that_is_wrong_bends_until_textures_agree():
@@ -272,7 +277,7 @@ def test_a_shape_that_is_wrong_bends_until_textures_agree():
     (labels, before), (both, after) = (
         (
             apart(poses, cameras, mesh),
-            misfit(texture_shifts(found, with_poses(cameras, poses), pictures, masks)),
+            shift_quantile(texture_shifts(found, with_poses(cameras, poses), pictures, masks)),
         )
         for found, poses in ends
     )
@@ -291,7 +296,9 @@ def test_most_textures_alone_are_not_believed_where_some_are_left_far_off(seen, 
         shift=np.where(some[:, None], [[2.0, 0.0]], [[0.1, 0.0]]),
     )
     before = replace(left, shift=np.full_like(one.shift, 5.0))
-    assert misfit([left]) == pytest.approx(0.1) and misfit([left], 0.9) == pytest.approx(2.0)
+    assert shift_quantile([left]) == pytest.approx(0.1) and shift_quantile(
+        [left], 0.9
+    ) == pytest.approx(2.0)
     begun = []
     monkeypatch.setattr(joint_alignment, "texture_shifts", lambda *_: [before])
     monkeypatch.setattr(

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from relit.fit.shape.picture_alignment import laid_on, moved_by
+from relit.fit.shape.picture_alignment import align_picture, moved_by
 
 SIZE = 64
 
@@ -28,7 +28,7 @@ def similarity(right, down, degrees=0.0, size=1.0):
 def test_a_similarity_is_found(picture, truth):
     where = np.zeros((SIZE, SIZE), bool)
     where[12:50, 10:54] = True
-    found = laid_on(picture, moved_by(picture, truth), where)
+    found = align_picture(picture, moved_by(picture, truth), where)
     corners = np.array([[12, 12, 1], [50, 12, 1], [12, 50, 1], [50, 50, 1]]).T
     assert np.abs(found @ corners - truth @ corners).max() < 0.1
 
@@ -38,11 +38,11 @@ def test_only_what_is_asked_for_counts(picture):
     where[10:54, 10:30] = True
     photo = moved_by(picture, truth)
     photo[:, 36:] = moved_by(picture, similarity(-2, -2))[:, 36:]
-    assert np.abs(laid_on(picture, photo, where) - truth).max() < 0.1
+    assert np.abs(align_picture(picture, photo, where) - truth).max() < 0.1
 
 
 def test_what_shows_no_structure_stays(picture):
     everywhere, nowhere = np.ones((SIZE, SIZE), bool), np.zeros((SIZE, SIZE), bool)
     flat = np.full((SIZE, SIZE, 3), 0.5, np.float32)
-    assert np.allclose(laid_on(flat, flat, everywhere), np.eye(2, 3))
-    assert np.allclose(laid_on(picture, flat, nowhere), np.eye(2, 3))
+    assert np.allclose(align_picture(flat, flat, everywhere), np.eye(2, 3))
+    assert np.allclose(align_picture(picture, flat, nowhere), np.eye(2, 3))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import IMAGE_FOLDERS, Frame, Reading, inside
+from relit.capture.frames import IMAGE_FOLDERS, Frame, Reading, path_inside
 from relit.capture.readers.colmap_binary import check_binary
 from relit.device import load_pycolmap
 from relit.errors import UserError
@@ -129,14 +129,14 @@ def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
     ]
     base = next((p / n for p in places for n in IMAGE_FOLDERS if (p / n).is_dir()), root)
     images = [model.image(i) for i in model.reg_image_ids()]
-    named = {inside(base, i.name, folder) for i in images}  # these belong to their own cameras
+    named = {path_inside(base, i.name, folder) for i in images}  # these belong to their own cameras
     spare = [
         f for f in sorted(base.rglob("*")) if f.suffix.lower() in EXTENSIONS and f not in named
     ]
     by_name, by_stem = _unique(spare, "name"), _unique(spare, "stem")
     frames, missing = [], []
     for image in sorted(images, key=lambda i: i.name):
-        file = inside(base, image.name, folder)
+        file = path_inside(base, image.name, folder)
         file = (
             file
             if file.is_file()

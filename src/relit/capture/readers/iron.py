@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, list_images, pose_from, read_json, read_text
+from relit.capture.frames import Frame, Reading, list_images, parse_json_file, pose_from, read_text
 from relit.conventions import cv_from_mitsuba_axes
 from relit.errors import UserError
 from relit.scene import Camera, Sphere
@@ -50,7 +50,7 @@ def read(path: Path, found: Path) -> Reading:
 
 
 def _frames(file: Path, root: Path, held_out: bool) -> list[Frame]:
-    content, folder = read_json(file), file.parent / "image"
+    content, folder = parse_json_file(file), file.parent / "image"
     photos = {p.stem: p for p in list_images(folder)}
     entries = {Path(name).stem: entry for name, entry in content.items()}
     if not entries or set(photos) != set(entries):
@@ -105,7 +105,7 @@ def _sees_origin(camera: Camera) -> bool:
     return bool(z > 1.0 and 0 < u < camera.width and 0 < v < camera.height)
 
 
-def read_light(root: Path) -> tuple[float | None, np.ndarray | None]:
+def read_flash_light(root: Path) -> tuple[float | None, np.ndarray | None]:
     """The true radiant intensity (light.txt) and offset (light_offset.txt; returned in OpenCV
     camera axes), of the folder or of its test/ or train/; None for what is not there. Raises
     UserError for files that hold no such numbers.

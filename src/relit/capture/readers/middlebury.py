@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, inside, pose_from, read_text
+from relit.capture.frames import Frame, Reading, path_inside, pose_from, read_text
 from relit.errors import UserError
 from relit.images import read_header
 from relit.scene import Camera
@@ -31,7 +31,7 @@ def read(path: Path, found: Path) -> Reading:
     note."""
     frames, missing = [], []
     for name, values in parse(read_text(found), found):
-        file = inside(found.parent, name, found)
+        file = path_inside(found.parent, name, found)
         if not file.is_file():
             missing.append(name)
             continue

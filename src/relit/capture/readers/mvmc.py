@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from relit import files
-from relit.capture.frames import Frame, Reading, image_folder, inside, read_json
+from relit.capture.frames import Frame, Reading, image_folder, parse_json_file, path_inside
 from relit.errors import UserError
 from relit.masks.rle import runs_from
 
@@ -49,7 +49,7 @@ def read(path: Path, found: Path) -> Reading:
     folder = image_folder(root) or root
     frames = []
     for entry in entries_of(found):
-        file = inside(folder, entry["filename"], found)
+        file = path_inside(folder, entry["filename"], found)
         if not file.is_file():
             raise UserError(
                 f"a photo of {ANNOTATIONS} is missing: '{entry['filename']}'",
@@ -64,7 +64,7 @@ def read(path: Path, found: Path) -> Reading:
 
 def entries_of(found: Path) -> list[dict]:
     """The annotations. Raises UserError where one names no photo."""
-    entries = read_json(found).get("annotations")
+    entries = parse_json_file(found).get("annotations")
     if not isinstance(entries, list) or not all(
         isinstance(e, dict) and isinstance(e.get("filename"), str) for e in entries
     ):

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from relit import files
-from relit.capture.frames import Frame, Reading, image_folder, list_images, read_json
+from relit.capture.frames import Frame, Reading, image_folder, list_images, parse_json_file
 from relit.capture.readers import mvmc
 from relit.errors import UserError, did_you_mean
 
@@ -79,7 +79,7 @@ def read(path: Path, found: Path) -> Reading:
         )
     photos = list_images(folder)
     held = (
-        set(_names(read_json(found / HELD_OUT), found / HELD_OUT))
+        set(_names(parse_json_file(found / HELD_OUT), found / HELD_OUT))
         if (found / HELD_OUT).is_file()
         else set()
     )
@@ -125,7 +125,7 @@ def read_hints(root: Path, names: list[str]) -> Hints | None:
 
 
 def _quadrants(path: Path, names: list[str]) -> Hints:
-    frames = read_json(path).get("frames")
+    frames = parse_json_file(path).get("frames")
     if not isinstance(frames, list):
         raise UserError(
             "quadrants.json has no list under 'frames'",

@@ -27,7 +27,13 @@ import cv2
 import numpy as np
 
 from relit.capture.corrections import corrected_labels
-from relit.capture.frames import check_max_side, image_folder, list_images, pose_from, read_json
+from relit.capture.frames import (
+    check_max_side,
+    image_folder,
+    list_images,
+    parse_json_file,
+    pose_from,
+)
 from relit.capture.labels import BOP_TRUTH, checked_labels, read_labels, which_objects
 from relit.capture.networks import Network, found_instances
 from relit.capture.photo import Decoder
@@ -296,7 +302,7 @@ def _camera(
 ) -> tuple[np.ndarray, float | None, tuple[float, float]]:
     """(world_from_camera, focal in pixels or None, principal point) of the photo's frame, or of the
     first where none is named like it. SfD writes the focal length as text."""
-    data = read_json(file)
+    data = parse_json_file(file)
     frames = (
         [f for f in data.get("frames") or [] if isinstance(f, dict)]
         if isinstance(data.get("frames"), list)
@@ -351,7 +357,7 @@ def _bop_camera(
     """As `_camera`, from BOP's cam_K; the world is the camera's frame (millimetres do not
     matter)."""
     try:
-        k = np.array(read_json(file)[str(int(photo.stem))]["cam_K"], np.float64).reshape(3, 3)
+        k = np.array(parse_json_file(file)[str(int(photo.stem))]["cam_K"], np.float64).reshape(3, 3)
         if not (np.isfinite(k).all() and k[0, 0] > 0):
             raise ValueError("cam_K makes no sense")
     except (KeyError, TypeError, ValueError, OverflowError) as error:

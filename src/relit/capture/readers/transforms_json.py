@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, inside, pose_from, read_json
+from relit.capture.frames import Frame, Reading, parse_json_file, path_inside, pose_from
 from relit.conventions import world_from_cv_camera
 from relit.errors import UserError
 from relit.geometry.lens import FisheyeLens
@@ -52,7 +52,7 @@ def read(path: Path, found: Path) -> Reading:
     """Read the training file and, where there is one, the test split beside it (as held-out
     frames)."""
     root, notes = found.parent, []
-    data = read_json(found)
+    data = parse_json_file(found)
     frames, missing = _frames(data, root, found)
     test_names = {
         str(n).replace("\\", "/").removeprefix("./") for n in _list(data.get("test_filenames"))
@@ -63,7 +63,7 @@ def read(path: Path, found: Path) -> Reading:
     ]
     test = root / "transforms_test.json"
     if test.is_file() and test != found:
-        held, gone = _frames(read_json(test), root, test)
+        held, gone = _frames(parse_json_file(test), root, test)
         frames += [Frame(f.path, f.name, f.camera, f.lens, f.mask, True) for f in held]
         if gone:
             notes.append(
@@ -128,13 +128,13 @@ def _frames(data: dict, root: Path, source: Path) -> tuple[list[Frame], list[str
             )
         what = f"'{entry['file_path'][:200]}'"
         pose = world_from_cv_camera(pose_from(entry.get("transform_matrix"), what, source))
-        file, aside = _image_file(inside(root, entry["file_path"], source), asides)
+        file, aside = _image_file(path_inside(root, entry["file_path"], source), asides)
         if file is None:
             missing.append(entry["file_path"])
             continue
         camera, lens = _camera({**data, **entry}, pose, file, what, source)
         mask = entry.get("mask_path")
-        mask = inside(root, mask, source) if isinstance(mask, str) and mask else None
+        mask = path_inside(root, mask, source) if isinstance(mask, str) and mask else None
         found.append(Frame(file, file.relative_to(root).as_posix(), camera, lens, mask, aside))
     return found, missing
 

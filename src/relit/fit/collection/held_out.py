@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.collection.options import CollectionOptions
-from relit.fit.collection.photos import Shot, crops_of
+from relit.fit.collection.photos import CollectionPhoto, collection_crops
 from relit.fit.collection.surface import (
     fit_collection_surface,
     light_family,
@@ -21,7 +21,13 @@ from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import corrected, make_bank
 from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume
-from relit.fit.registration.fine_detail import borne_out, detail_of, laid_on, surface_of, told_apart
+from relit.fit.registration.fine_detail import (
+    compare_detail,
+    detail_correlation,
+    detail_of,
+    photo_values_at,
+    surface_of,
+)
 from relit.fit.registration.photos.framing import is_cut, slide
 from relit.fit.registration.photos.poses import COARSE, GREY, PARTS, SLACK, best_refined
 from relit.fit.registration.register import (
@@ -82,8 +88,8 @@ def held_out_stage(
             "held_out", steps=options.frozen_steps, title="photos that were set aside"
         ) as stage:
             new = [replace(s, camera=with_median_field(s, cameras)) for s in held]
-            found = register(new, model, degrees, options, seed)
-            found = descend(new, found, model, options, seed, LONGER)
+            found = register_held_out(new, model, degrees, options, seed)
+            found = refine_held_out_cameras(new, found, model, options, seed, LONGER)
             found = told_by_others(new, found, shots, cameras, mesh, model, degrees, options, seed)
             bank = make_bank(found, [s.rgb for s in new], [s.mask for s in new])
             size = maps["roughness"].shape[0]
@@ -127,7 +133,7 @@ def held_out_stage(
     return found, kept["lights"]
 
 
-def with_median_field(shot: Shot, cameras: list[Camera]) -> Camera:
+def with_median_field(shot: CollectionPhoto, cameras: list[Camera]) -> Camera:
     """A held-out photo without EXIF starts with the median focal length of the others, in units of
     the longer side."""
     if shot.photo.focal_hint is not None or shot.photo.camera is not None:
@@ -139,12 +145,17 @@ def with_median_field(shot: Shot, cameras: list[Camera]) -> Camera:
 
 
 def find(
-    shots: list[Shot], model: VolumeModel, degrees: float, keep: int, seed: int, slid: bool = False
+    shots: list[CollectionPhoto],
+    model: VolumeModel,
+    degrees: float,
+    keep: int,
+    seed: int,
+    slid: bool = False,
 ):
     """(crops, their descriptors, what renders the model, `keep` hypotheses of every photo) by
     search from all around. slid: those that the frame cuts with place and size free (takes a second
     a photo)."""
-    crops, hints = crops_of(shots), np.array([s.direction for s in shots])
+    crops, hints = collection_crops(shots), np.array([s.direction for s in shots])
     render, rings = volume_render(replace(model, appearance=shade_plain)), crop_rings(crops, PARTS)
     gallery = make_gallery(render, views_from(directions_around(AGAIN, seed)), PARTS)
     hinted = np.linalg.norm(hints, axis=1) > 0.5
@@ -160,8 +171,12 @@ def find(
     return crops, rings, render, found
 
 
-def register(
-    shots: list[Shot], model: VolumeModel, degrees: float, options: CollectionOptions, seed: int
+def register_held_out(
+    shots: list[CollectionPhoto],
+    model: VolumeModel,
+    degrees: float,
+    options: CollectionOptions,
+    seed: int,
 ) -> list[Camera]:
     """The cameras of photos that the model has not seen, by search and local refinement."""
     crops, rings, render, found = find(shots, model, degrees, options.hypotheses, seed, slid=True)
@@ -189,9 +204,14 @@ def told_by_others(
         return found
     surface = surface_of(mesh)
     laid = np.array(
-        [laid_on(surface, c, detail_of(s.rgb, s.mask)) for c, s in zip(cameras, shots, strict=True)]
+        [
+            photo_values_at(surface, c, detail_of(s.rgb, s.mask))
+            for c, s in zip(cameras, shots, strict=True)
+        ]
     )
-    told = told_apart(surface, [detail_of(s.rgb, s.mask) for s in new], found, places, laid).moved
+    told = compare_detail(
+        surface, [detail_of(s.rgb, s.mask) for s in new], found, places, laid
+    ).moved
     return [told.get(i, c) for i, c in enumerate(found)]
 
 
@@ -208,7 +228,7 @@ class SecondLook:
 
 
 def look_again(
-    shots: list[Shot],
+    shots: list[CollectionPhoto],
     cameras: list[Camera],
     model: VolumeModel,
     degrees: float,
@@ -228,12 +248,14 @@ def look_again(
             out[i] = moved[i] = camera
     surface = surface_of(extract_mesh(dense_values(model.grid), faces=options.faces))
     pictures = [detail_of(s.rgb, s.mask) for s in shots]
-    told = told_apart(surface, pictures, out, far_from(out, places))
+    told = compare_detail(surface, pictures, out, far_from(out, places))
     out = [told.moved.get(i, c) for i, c in enumerate(out)]
     turns = np.zeros(len(out))
     for i, camera in told.as_well.items():
         turns[i] = turn_between(out[i].world_from_camera, camera.world_from_camera)
-    return SecondLook(out, sorted(moved | told.moved), borne_out(surface, pictures, out), turns)
+    return SecondLook(
+        out, sorted(moved | told.moved), detail_correlation(surface, pictures, out), turns
+    )
 
 
 def other_places(
@@ -281,7 +303,7 @@ def other_places(
     ]
     if not kept:
         return []
-    placed = descend(
+    placed = refine_held_out_cameras(
         [shots[photo[k]] for k in kept],
         [cameras[photo[k]].with_pose(poses[k]) for k in kept],
         model,
@@ -307,8 +329,8 @@ def turn_between(a: np.ndarray, b: np.ndarray) -> float:
     return rotation_angle(a[:3, :3].T @ b[:3, :3])
 
 
-def descend(
-    shots: list[Shot],
+def refine_held_out_cameras(
+    shots: list[CollectionPhoto],
     cameras: list[Camera],
     model: VolumeModel,
     options: CollectionOptions,

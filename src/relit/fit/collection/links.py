@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from relit.cameras.links import Group, link_photos
-from relit.capture.sphere import View, find_sphere, up_direction
+from relit.capture.sphere import SphereView, find_sphere, up_direction
 from relit.conventions import similarity
 from relit.device import load_pycolmap
 from relit.errors import UserError
-from relit.fit.collection.photos import Shot
+from relit.fit.collection.photos import CollectionPhoto
 from relit.fit.passes.load_photos import resize
 from relit.fit.registration.photos.depth import depth_limit
 from relit.fit.registration.photos.few import FEW
@@ -58,7 +58,7 @@ CONTRADICTED = (
 LOSS = 0.03  # of score that a photo may lose where its group wants it
 
 
-def links_stage(shots: list[Shot], run, seed: int) -> list[Group]:
+def links_stage(shots: list[CollectionPhoto], run, seed: int) -> list[Group]:
     """Groups of linked photos, kept in the run folder: all of them where they come with cameras.
     None where pycolmap is missing or nothing matches."""
     if all(s.given is not None for s in shots):
@@ -83,7 +83,7 @@ def links_stage(shots: list[Shot], run, seed: int) -> list[Group]:
     return groups
 
 
-def group_of_cameras(shots: list[Shot]) -> Group:
+def group_of_cameras(shots: list[CollectionPhoto]) -> Group:
     """The given cameras as if matches had found them: believed like those, as far as the
     silhouettes agree."""
     focals = np.array([s.camera.fx / max(s.camera.width, s.camera.height) for s in shots])
@@ -96,7 +96,7 @@ def group_of_cameras(shots: list[Shot]) -> Group:
     )
 
 
-def _full(shot: Shot):
+def _full(shot: CollectionPhoto):
     """(rgb, mask, focal length or 0) of the photo at its own size."""
     pixels = shot.photo.load()
     h, w = pixels.rgb.shape[:2]
@@ -105,7 +105,7 @@ def _full(shot: Shot):
     return pixels.rgb, mask, float(known or 0)
 
 
-def with_focals(shots: list[Shot], groups: list[Group]) -> list[Shot]:
+def with_focals(shots: list[CollectionPhoto], groups: list[Group]) -> list[CollectionPhoto]:
     """The shots, those of groups with the focal length that COLMAP found."""
     out = list(shots)
     for group in groups:
@@ -116,8 +116,8 @@ def with_focals(shots: list[Shot], groups: list[Group]) -> list[Shot]:
     return out
 
 
-def placed(
-    group: Group, shots: list[Shot], directions: np.ndarray, heard=None
+def poses_of_group(
+    group: Group, shots: list[CollectionPhoto], directions: np.ndarray, heard=None
 ) -> tuple[np.ndarray, float]:
     """Poses (n, 4, 4) of a group in the object's frame, the object within radius 1 about the
     origin, and the median angle to the hints (degrees; 0 where fewer than three photos have one).
@@ -129,7 +129,7 @@ def placed(
     cameras = [shots[i].camera.with_pose(p) for i, p in zip(group.photos, group.poses, strict=True)]
     heard = np.ones(len(cameras), bool) if heard is None else heard
     views = [
-        View(c, None, shots[i].mask)
+        SphereView(c, None, shots[i].mask)
         for c, i, h in zip(cameras, group.photos, heard, strict=True)
         if h
     ]
@@ -163,7 +163,7 @@ def placed(
 def poses_from_links(
     crops: list[Crop],
     groups: list[Group],
-    shots: list[Shot],
+    shots: list[CollectionPhoto],
     directions: np.ndarray,
     degrees: float,
     keep: int,
@@ -179,7 +179,7 @@ def poses_from_links(
         return None
     members, everyone = groups[0].photos, np.ones(len(groups[0].photos), bool)
     try:
-        own, angle = placed(groups[0], shots, directions)
+        own, angle = poses_of_group(groups[0], shots, directions)
     except UserError as error:
         say(f"note: the linked photos have no common object ({error})")
         return None
@@ -242,7 +242,7 @@ def begun_with(
 
 
 def without_one(
-    crops: list[Crop], group: Group, shots: list[Shot], directions: np.ndarray, seed: int
+    crops: list[Crop], group: Group, shots: list[CollectionPhoto], directions: np.ndarray, seed: int
 ):
     """(poses (n, 4, 4), model, scores (n,), which) of the few photos of a group but one, which is
     in its place as well but whose mask is
@@ -253,7 +253,7 @@ def without_one(
     for i in range(count if FEWEST < count < FEW else 0):
         heard = np.arange(count) != i
         try:
-            own, _ = placed(group, shots, directions, heard)
+            own, _ = poses_of_group(group, shots, directions, heard)
             model, scores = begun_with(crops, group.photos, own, heard, seed)
         except (UserError, ValueError):
             continue

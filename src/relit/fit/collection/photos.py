@@ -23,7 +23,7 @@ GIVEN = 20.0  # degrees that directions from given cameras may be off
 
 
 @dataclass(frozen=True)
-class Shot:
+class CollectionPhoto:
     """One photo, decoded. rgb: (H, W, 3) linear, mask: (H, W). camera: intrinsics by EXIF or guess,
     pose the identity.
     direction: (3,) hint, or 0. given: (4, 4) world_from_camera in the capture's own frame, where
@@ -46,7 +46,7 @@ class Shot:
 
 def load_shots(
     capture: Capture, options: CollectionOptions, run
-) -> tuple[list[Shot], list[Shot], float]:
+) -> tuple[list[CollectionPhoto], list[CollectionPhoto], float]:
     """Training shots, held-out shots, and how many degrees the hints may be off."""
     photos, held = list(capture.photos), list(capture.held_out)
     if options.holdout > 1 and not held:
@@ -81,7 +81,9 @@ def load_shots(
             mask = np.clip(resize(mask, w, h), 0, 1)
         direction = np.zeros(3) if hints is None else hints.directions.get(photo.name, np.zeros(3))
         given = photo.camera.world_from_camera if of_cameras and photo.camera is not None else None
-        shots.append(Shot(photo, rgb, mask, guessed_camera(photo, w, h), direction, given))
+        shots.append(
+            CollectionPhoto(photo, rgb, mask, guessed_camera(photo, w, h), direction, given)
+        )
     if guessed:
         run.say(
             f"note: {guessed} photos have no mask; they were guessed by GrabCut from the pictures' middle: look at them"
@@ -124,6 +126,6 @@ def guessed_camera(photo: Photo, width: int, height: int) -> Camera:
     return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(4))
 
 
-def crops_of(shots: list[Shot]) -> list[Crop]:
+def collection_crops(shots: list[CollectionPhoto]) -> list[Crop]:
     """What registration compares."""
     return even_colours([crop_photo(s.rgb, s.mask, s.camera) for s in shots])

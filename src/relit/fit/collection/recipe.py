@@ -36,7 +36,7 @@ from relit.errors import UserError
 from relit.fit.collection.held_out import held_out_stage, look_again
 from relit.fit.collection.links import links_stage, poses_from_links, with_focals
 from relit.fit.collection.options import CollectionOptions, options_for
-from relit.fit.collection.photos import LEAST_PHOTOS, Shot, crops_of, load_shots
+from relit.fit.collection.photos import LEAST_PHOTOS, CollectionPhoto, collection_crops, load_shots
 from relit.fit.collection.shape import opened_stage, volume_stage
 from relit.fit.collection.surface import (
     fit_collection_surface,
@@ -49,7 +49,7 @@ from relit.fit.passes.pixels import PixelBank, place_cameras
 from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.volume import VolumeModel
 from relit.fit.registration.photos.growth import find_poses
-from relit.fit.registration.photos.poses import GREY, agreement, schedule_of
+from relit.fit.registration.photos.poses import GREY, cross_validated_share, schedule_of
 from relit.fit.shape.inpaint import painted_over
 from relit.fit.shape.unseen import seen_faces
 from relit.geometry.atlas import unwrap
@@ -114,7 +114,7 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
 
 
 def pose_stage(
-    shots: list[Shot],
+    shots: list[CollectionPhoto],
     groups: list[Group],
     degrees: float,
     run,
@@ -143,7 +143,7 @@ def pose_stage(
 
 
 def find_all(
-    shots: list[Shot],
+    shots: list[CollectionPhoto],
     groups: list[Group],
     degrees: float,
     run,
@@ -152,7 +152,7 @@ def find_all(
 ) -> dict[str, np.ndarray]:
     """poses (P, 4, 4), scores (P,), agreement (a share, NaN where it was not tried), linked (P,)
     bool."""
-    crops, hints = crops_of(shots), np.array([s.direction for s in shots])
+    crops, hints = collection_crops(shots), np.array([s.direction for s in shots])
     schedule, without = schedule_of(options.rounds), options.without
     try:
         begun = (
@@ -186,12 +186,12 @@ def find_all(
     linked = np.zeros(len(shots), bool) if begun is None else begun[2]
     share = np.nan
     if len(shots) >= CHECKED and "search" not in without and linked.mean() < 0.5:
-        share = agreement(crops, poses, seed)
+        share = cross_validated_share(crops, poses, seed)
     return {"poses": poses, "scores": scores, "agreement": np.array(share), "linked": linked}
 
 
 def judge_poses(
-    scores: np.ndarray, share: float, shots: list[Shot], options: CollectionOptions, run
+    scores: np.ndarray, share: float, shots: list[CollectionPhoto], options: CollectionOptions, run
 ) -> None:
     """Say how well the photos agree, and which do not. share: see `agreement`, NaN where it was not
     tried. Raises UserError (code 4) when the poses are wrong as a whole."""
@@ -393,7 +393,12 @@ def surface_stage(
 
 
 def assemble(
-    shots: list[Shot], cameras: list[Camera], lights: np.ndarray, mesh: Mesh, maps, held: list[str]
+    shots: list[CollectionPhoto],
+    cameras: list[Camera],
+    lights: np.ndarray,
+    mesh: Mesh,
+    maps,
+    held: list[str],
 ) -> Asset:
     """The asset in the object's own frame. Cameras come at the photos' own size."""
     own = [c.resized(s.photo.width, s.photo.height) for c, s in zip(cameras, shots, strict=True)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from relit.errors import UserError
 from relit.fit.collection.options import CollectionOptions
-from relit.fit.collection.photos import crops_of
+from relit.fit.collection.photos import collection_crops
 from relit.fit.passes.pixels import PixelBank, corrected, make_bank, place_cameras
 from relit.fit.passes.volume import (
     VolumeModel,
@@ -61,9 +61,11 @@ def volume_stage(
     bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], silhouettes), weights, seed)
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
     o = volume_options(options)
-    values = hull_of(cameras, silhouettes, o.levels[0])
+    values = tolerant_hull(cameras, silhouettes, o.levels[0])
     limit = (
-        depth_limit(crops_of(shots), np.array([c.world_from_camera for c in cameras]), o.levels[0])
+        depth_limit(
+            collection_crops(shots), np.array([c.world_from_camera for c in cameras]), o.levels[0]
+        )
         if len(shots) < FEW
         else None
     )
@@ -106,7 +108,7 @@ def opened_stage(
     else:
         with run.stage("hollows", title="hollows that no silhouette shows") as stage:
             hull, show = (
-                hull_of(cameras, [s.mask for s in shots], FIRST.nodes),
+                tolerant_hull(cameras, [s.mask for s in shots], FIRST.nodes),
                 run.progress("hollows that no silhouette shows"),
             )
             gone = open_lids(
@@ -143,7 +145,7 @@ def opened_stage(
     return cameras
 
 
-def hull_of(cameras: list[Camera], masks: list[np.ndarray], nodes: int) -> np.ndarray:
+def tolerant_hull(cameras: list[Camera], masks: list[np.ndarray], nodes: int) -> np.ndarray:
     """The visual hull by a vote that forgives poses that are a few degrees off."""
     for tolerance in (0.1, 0.2, 0.35, 0.5):
         try:

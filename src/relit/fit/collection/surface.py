@@ -25,7 +25,7 @@ from relit.fit.passes.surface import (
     drawn_points,
     dual_values,
     material_prior,
-    neighbours,
+    neighbour_points,
     parsimony,
 )
 from relit.lighting.neural_pil import load_neural_pil
@@ -33,7 +33,7 @@ from relit.lighting.per_photo import (
     TEXELS,
     LightComponents,
     PhotoLights,
-    light_prior,
+    load_light_prior,
     log_lights,
     mean_level,
 )
@@ -103,7 +103,7 @@ def light_family(options: CollectionOptions):
     return (
         load_neural_pil(options.light_network)
         if options.light_network
-        else LightComponents(*light_prior())
+        else LightComponents(*load_light_prior())
     )
 
 
@@ -112,7 +112,7 @@ def start_collection_surface(
 ) -> CollectionSurface:
     """tints: (V, 3) mean radiance of the object in each photo; albedo: mean base colour. A light of
     radiance L shows albedo * L."""
-    family = LightComponents(*light_prior()) if family is None else family
+    family = LightComponents(*load_light_prior()) if family is None else family
     gains = np.log(np.maximum(tints, 1e-3) / albedo / mean_level(family)).astype(np.float32)
     return CollectionSurface(
         material,
@@ -203,7 +203,7 @@ def fit_collection_surface(
         batch, points = drawn_points(bank, mesh, rng, count)
         valid = points.valid
         dr.eval(batch.view)
-        near = neighbours(mesh, points, options.similarity_reach, rng)
+        near = neighbour_points(mesh, points, options.similarity_reach, rng)
         dr.eval(near, rng)
         shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (count - 1))
         of = lights.of(dr.repeat(batch.view, options.directions))

@@ -22,8 +22,8 @@ import numpy as np
 
 from relit.conventions import srgb_from_linear
 from relit.fit.registration.instances.azimuth import turned_by
-from relit.fit.registration.instances.views import View
-from relit.fit.shape.picture_alignment import laid_on, moved_by
+from relit.fit.registration.instances.views import InstanceView
+from relit.fit.shape.picture_alignment import align_picture, moved_by
 from relit.geometry.revolution_axis import Axis
 from relit.reference.mitsuba_scene import Scene, render
 from relit.reference.photographed import lit_scene
@@ -51,7 +51,7 @@ AROUND = 8
 
 def turned_as_shown(
     asset: Asset,
-    views: list[View],
+    views: list[InstanceView],
     cameras: list[Camera],
     poses: np.ndarray,
     axis: Axis,
@@ -72,7 +72,7 @@ def turned_as_shown(
         nonlocal count
         turned = [turned_by(p, axis, a) for p, a in zip(poses, angles, strict=True)]
         moves = {v.key: np.linalg.inv(t) @ p for v, t, p in zip(views, turned, poses, strict=True)}
-        scene = lit_scene(moved(asset, moves))
+        scene = lit_scene(with_instances_moved(asset, moves))
         count += 1
         progress(count)
         return np.array(
@@ -119,7 +119,7 @@ def places(found: np.ndarray) -> np.ndarray:
     return np.argsort(rank, axis=0, kind="stable")
 
 
-def compared(view: View) -> tuple[np.ndarray, np.ndarray]:
+def compared(view: InstanceView) -> tuple[np.ndarray, np.ndarray]:
     """A view's photo, shrunk to SIDE and as displays show it (h, w, 3), and which of its pixels are
     all the instance's (h, w) bool."""
     small = view.camera.within(SIDE)
@@ -153,12 +153,12 @@ def difference(
         )
         for k in (0, 1)
     ]
-    at = laid_on(sum(pictures) / 2, photo, solid)
+    at = align_picture(sum(pictures) / 2, photo, solid)
     one, other = ((moved_by(p, at) - photo)[solid] for p in pictures)
     return float((one * other).mean())
 
 
-def moved(asset: Asset, moves: dict[int, np.ndarray]) -> Asset:
+def with_instances_moved(asset: Asset, moves: dict[int, np.ndarray]) -> Asset:
     """The asset with some instances, by label, moved by (4, 4) in the world."""
     stand = [
         i

@@ -9,7 +9,7 @@ import numpy as np
 
 from relit.conventions import similarity
 from relit.fit.duplicates.options import DuplicatesOptions
-from relit.fit.duplicates.scene import alone_bank, photo_bank, scene_mesh, spread
+from relit.fit.duplicates.scene import alone_bank, photo_bank, scene_mesh, spread_moves
 from relit.fit.passes.pixels import PixelBank
 from relit.fit.passes.surface import SurfaceOptions
 from relit.fit.registration.instances.views import ANOTHER_PHOTO
@@ -36,7 +36,7 @@ class LitPile:
     level: float
 
 
-def surface_options(o: DuplicatesOptions) -> SurfaceOptions:
+def pile_surface_options(o: DuplicatesOptions) -> SurfaceOptions:
     off = {"metallic_binary": 0.0, "metallic_sparse": 0.0} if "metal" in o.without else {}
     light = {"light_tint": TINT, "light_cells": True}
     return SurfaceOptions(
@@ -78,7 +78,7 @@ def lit_pile(
     labels = [(keys[own] % ANOTHER_PHOTO).tolist() for own in shown]
     whole = pile
     if alone:
-        moves = spread(standing, scene_from_photo)
+        moves = spread_moves(standing, scene_from_photo)
         whole, radiance = scene_mesh(mesh, parts, standing, scene_from_photo, pixels, camera, moves)
         instances = [parts["view_instances"][own].tolist() for own in shown]
         placed = [

@@ -22,9 +22,9 @@ import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from relit.fit.passes.pixels import PixelBank, RayBatch, drawn_from
-from relit.fit.registration.instances.growth import seen_from
-from relit.fit.registration.instances.views import View
-from relit.fit.shape.outlines import trace
+from relit.fit.registration.instances.growth import viewing_directions
+from relit.fit.registration.instances.views import InstanceView
+from relit.fit.shape.outlines import trace_rays
 from relit.geometry.symmetry import Plane, symmetry_plane
 from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Mesh
@@ -100,7 +100,7 @@ class MirroredRays:
         batch.d = dr.select(mirrored, d - 2 * dr.dot(d, self.normal) * self.normal, batch.d)
 
 
-def find_symmetry(mesh: Mesh, views: list[View], poses: np.ndarray) -> Symmetry | None:
+def find_symmetry(mesh: Mesh, views: list[InstanceView], poses: np.ndarray) -> Symmetry | None:
     """The plane in which a mesh in the unit frame is its own mirror image; None where it is not,
     the views are too small to tell, or they
     stand all around it: half of the mirrored ones within APART of another. Then a plane that is not
@@ -118,13 +118,13 @@ def find_symmetry(mesh: Mesh, views: list[View], poses: np.ndarray) -> Symmetry 
 
 def mirrored_apart(plane: Plane, poses: np.ndarray) -> float:
     """Degrees between each mirrored view and the next one that is not mirrored, the median."""
-    near = (seen_from(plane.mirror @ poses) @ seen_from(poses).T).max(1)
+    near = (viewing_directions(plane.mirror @ poses) @ viewing_directions(poses).T).max(1)
     return float(np.degrees(np.median(np.arccos(np.clip(near, -1, 1)))))
 
 
 def mirrored_views(
-    symmetry: Symmetry, views: list[View], poses: np.ndarray
-) -> tuple[list[View], np.ndarray]:
+    symmetry: Symmetry, views: list[InstanceView], poses: np.ndarray
+) -> tuple[list[InstanceView], np.ndarray]:
     """The views as mirrored cameras have them, and where these stand: nothing is known where the
     object is not even."""
     shown = [
@@ -134,7 +134,9 @@ def mirrored_views(
     return shown, symmetry.plane.mirror @ poses
 
 
-def mirrored_rays(symmetry: Symmetry, bank: PixelBank, shown: list[View]) -> MirroredRays | None:
+def mirrored_rays(
+    symmetry: Symmetry, bank: PixelBank, shown: list[InstanceView]
+) -> MirroredRays | None:
     """The rays of the bank that count mirrored, by what is known in `mirrored_views`; None where
     there are none."""
     known = np.concatenate([v.known.ravel() for v in shown]) > 0.5
@@ -146,14 +148,14 @@ def mirrored_rays(symmetry: Symmetry, bank: PixelBank, shown: list[View]) -> Mir
     return MirroredRays(normal, dr.opaque(mi.Float, symmetry.plane.offset), mi.UInt32(chosen))
 
 
-def even_pixels(symmetry: Symmetry, view: View, pose: np.ndarray) -> np.ndarray:
+def even_pixels(symmetry: Symmetry, view: InstanceView, pose: np.ndarray) -> np.ndarray:
     """(h, w) bool: pixels off the outline around which the mesh, met by mirrored rays, has the
     silhouette of the view but for the errors of its shape."""
     h, w = view.mask.shape
     thick = max(LEAST, round(THICK * max(h, w)))
     camera = view.camera.with_pose(symmetry.plane.mirror @ pose)
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-    depth, _, _ = trace(build_geometry(symmetry.mesh), camera, x.ravel(), y.ravel())
+    depth, _, _ = trace_rays(build_geometry(symmetry.mesh), camera, x.ravel(), y.ravel())
     own = view.mask > 0.5
     wrong = (np.isfinite(depth).reshape(h, w) != own) & (view.known > 0.5)
     uneven = binary_erosion(wrong, iterations=thick)

@@ -26,7 +26,7 @@ DEPTH = 12.0  # times as uncertain along the line of sight as across
 
 
 @dataclass(frozen=True)
-class Scene:
+class SharedScene:
     """What several photos show together. motions: for each photo first_from_photo (4, 4), or None
     where it could not be related. standing: (K, 4, 4) first_from_object of the instances. of_view:
     (N,) which of them each view shows, -1 for views of photos without a motion."""
@@ -36,7 +36,7 @@ class Scene:
     of_view: np.ndarray
 
 
-def gather(standing: np.ndarray, photo: np.ndarray) -> Scene:
+def gather(standing: np.ndarray, photo: np.ndarray) -> SharedScene:
     """The scene of views at photo_from_object `standing` (N, 4, 4), from photos number `photo`
     (N,). The first photo's frame is the scene's."""
     standing, photo = np.asarray(standing, np.float64), np.asarray(photo)
@@ -63,7 +63,7 @@ def gather(standing: np.ndarray, photo: np.ndarray) -> Scene:
             else:
                 of_view[k] = len(known)
                 known.append(motion @ standing[k])
-    return Scene(motions, agreed(standing, photo, motions, of_view, len(known)), of_view)
+    return SharedScene(motions, agreed(standing, photo, motions, of_view, len(known)), of_view)
 
 
 def motion_of(

@@ -21,18 +21,18 @@ from relit.fit.duplicates.mirrored_silhouettes import (
     symmetry_from,
 )
 from relit.fit.duplicates.options import DuplicatesOptions
-from relit.fit.duplicates.photo_motions import Scene, gather
-from relit.fit.duplicates.poses import named
+from relit.fit.duplicates.photo_motions import SharedScene, gather
+from relit.fit.duplicates.poses import instance_name
 from relit.fit.duplicates.vessels import body_axis
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.fit.registration.instances.near_symmetry_search import coherent_turns
 from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.outliers import odd_instances, view_errors
 from relit.fit.registration.instances.views import (
-    View,
+    InstanceView,
     carved,
-    crops_of,
     hold_distances,
+    instance_crops,
     move_poses,
     moved_poses,
     pixel_bank,
@@ -66,7 +66,7 @@ CLOSE, CLOSER = (
 
 
 Seek = Callable[
-    [list[View], np.ndarray, np.ndarray, VolumeModel, Mesh, float], dict[int, np.ndarray]
+    [list[InstanceView], np.ndarray, np.ndarray, VolumeModel, Mesh, float], dict[int, np.ndarray]
 ]  # see `fit.duplicates.recover_unregistered.joiners`
 
 
@@ -160,9 +160,9 @@ def pass_from(saved: dict[str, np.ndarray]) -> Pass:
 
 
 def joint_stages(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
-    others: list[View],
+    others: list[InstanceView],
     seek: Callable,
     run,
     options: DuplicatesOptions,
@@ -223,7 +223,7 @@ def worse(before: Pass, after: Pass) -> bool:
 
 
 def joint_stage(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     number: int,
     run,
@@ -251,7 +251,7 @@ def joint_stage(
         some = [views[k] for k in np.flatnonzero(~odd)]
         for k in np.flatnonzero(odd):
             run.say(
-                f"note: the object with {named(views[k])} is left out: what it shows does not agree with the model of all"
+                f"note: the object with {instance_name(views[k])} is left out: what it shows does not agree with the model of all"
             )
         mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
         if "textures" not in options.without:
@@ -261,7 +261,7 @@ def joint_stage(
                 if off >= CLOSE or (
                     last and last.mixed
                 ):  # where textures lie on one another all stand right, but after a mixed pass
-                    turned = told_apart(mesh, some, moved, run, options, seed)
+                    turned = resolve_near_symmetry(mesh, some, moved, run, options, seed)
         turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
         symmetry = (
             None
@@ -299,8 +299,13 @@ def bounded_from_one_side(mesh: Mesh, symmetry: Symmetry | None, last: Pass | No
     return news and body_axis(mesh) is None
 
 
-def told_apart(
-    mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions, seed: int
+def resolve_near_symmetry(
+    mesh: Mesh,
+    views: list[InstanceView],
+    poses: np.ndarray,
+    run,
+    options: DuplicatesOptions,
+    seed: int,
 ) -> np.ndarray | None:
     """The poses (N, 4, 4) with those turned that stand wrong by a turn by which the object nearly
     looks like itself (`fit.registration.instances.near_symmetry_search.coherent_turns`); None where there are none. Poses are
@@ -308,7 +313,7 @@ def told_apart(
     (fit/registration/instances/revolution_search.py), and not asked. mesh: of the pass."""
     if len(views) < 4 or "search" in options.without or body_axis(mesh) is not None:
         return None
-    crops = crops_of(views)
+    crops = instance_crops(views)
     turned = coherent_turns(
         views,
         crops,
@@ -323,7 +328,7 @@ def told_apart(
 
 
 def followed(
-    mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions
+    mesh: Mesh, views: list[InstanceView], poses: np.ndarray, run, options: DuplicatesOptions
 ) -> tuple[Mesh, np.ndarray, float | None]:
     """(mesh, poses, off) as outlines, and where these are not exact textures too, have them. off:
     pixels by which textures do not lie on one another then (median); None where they have no part
@@ -344,7 +349,7 @@ def followed(
 
 def placed_by_outlines(
     mesh: Mesh,
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     run,
     options: DuplicatesOptions,
@@ -360,7 +365,7 @@ def placed_by_outlines(
 
 
 def shape_and_poses(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     run,
     stage,
@@ -381,7 +386,7 @@ def shape_and_poses(
     values = (
         vessel
         if vessel is not None
-        else hull_of([*views, *beside], np.concatenate([poses, there]), options.levels[0])
+        else instance_hull([*views, *beside], np.concatenate([poses, there]), options.levels[0])
     )
     model = start_model(values, np.maximum(inside.mean(0), 1e-3), None, full=False)
     scene = related(views, poses, run)
@@ -416,7 +421,7 @@ def shape_and_poses(
     return model, bank, moved_poses(bank, views, poses)
 
 
-def hull_of(views: list[View], poses: np.ndarray, nodes: int) -> np.ndarray:
+def instance_hull(views: list[InstanceView], poses: np.ndarray, nodes: int) -> np.ndarray:
     """Distances (n, n, n) of the visual hull. Raises UserError where nothing is left."""
     try:
         return carved(views, poses, nodes, 0.15, Search.depth, crossed=True)
@@ -429,12 +434,12 @@ def hull_of(views: list[View], poses: np.ndarray, nodes: int) -> np.ndarray:
         ) from None
 
 
-def pose_rate(views: list[View], options: DuplicatesOptions) -> float:
+def pose_rate(views: list[InstanceView], options: DuplicatesOptions) -> float:
     """Step of the pose corrections in the volume pass."""
     return 0.0 if "refinement" in options.without or len(views) < 2 else options.refine_poses
 
 
-def related(views: list[View], poses: np.ndarray, run=None) -> Scene:
+def related(views: list[InstanceView], poses: np.ndarray, run=None) -> SharedScene:
     """How the photos stand to each other (see `fit.duplicates.recipe.photo_motions`); says so where a run
     is given and there are several."""
     scene = gather(np.linalg.inv(poses), np.array([v.photo for v in views]))
@@ -458,7 +463,7 @@ def motion_or_none(motion: np.ndarray | None) -> np.ndarray:
     return np.eye(4) if motion is None else motion
 
 
-def light_turns(views: list[View], scene: Scene):
+def light_turns(views: list[InstanceView], scene: SharedScene):
     """Rotations from each view's photo to the first one's axes, flat, for `shade_world`."""
     turns = [motion_or_none(scene.motions[v.photo])[:3, :3] for v in views]
     return mi.Float(np.concatenate([t.ravel() for t in turns]).astype(np.float32))

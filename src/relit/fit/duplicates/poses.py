@@ -15,12 +15,12 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates.options import DuplicatesOptions
-from relit.fit.registration.instances.growth import seen_from
+from relit.fit.registration.instances.growth import viewing_directions
 from relit.fit.registration.instances.options import Search
 from relit.fit.registration.instances.rounds import ambiguous
 from relit.fit.registration.instances.search import LEFT_OUT
 from relit.fit.registration.instances.trials import place_few
-from relit.fit.registration.instances.views import COARSE, View, carved, views_of
+from relit.fit.registration.instances.views import COARSE, InstanceView, carved, views_of
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import rotation_angle
 from relit.run import run_arrays
@@ -35,7 +35,7 @@ AGREES = 0.2  # an instance whose score lies further below the median did not fi
 Shot = tuple[Pixels, Camera]  # a decoded photo and its camera in its own frame (identity pose)
 
 
-def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[View]:
+def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[InstanceView]:
     """The views of all photos, in windows of at most `side` pixels."""
     out = []
     for number, (pixels, camera) in enumerate(shots):
@@ -94,7 +94,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
             )
         for k in np.flatnonzero(~registered & (scores > LEFT_OUT)):
             run.say(
-                f"note: the object with {named(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only"
+                f"note: the object with {instance_name(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only"
             )
         unsure = np.zeros(len(views))
         if registered.sum() > 2 and "refinement" not in options.without:
@@ -110,7 +110,7 @@ def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
         )
         if matched and not {"guided", "refinement"} & set(options.without):
             poses = adjusted_poses(matched, poses, registered, run)
-        poses = centred(views, poses, registered)
+        poses = centre_poses(views, poses, registered)
         keys = np.array([v.key for v in views])
         axes = scores == LEFT_OUT
         stage.save(
@@ -137,10 +137,10 @@ def linked_together(count: int, told: tuple) -> np.ndarray:
     return member == np.bincount(member).argmax()
 
 
-def say_ambiguous(views: list[View], unsure: np.ndarray, registered: int, run) -> None:
+def say_ambiguous(views: list[InstanceView], unsure: np.ndarray, registered: int, run) -> None:
     """Say whose poses the pictures do not tell. unsure: (N,) degrees, see
     `instance_rounds.ambiguous`."""
-    some = [named(views[k]).removeprefix("label ") for k in np.flatnonzero(unsure)]
+    some = [instance_name(views[k]).removeprefix("label ") for k in np.flatnonzero(unsure)]
     if some:
         run.say(
             f"note: {len(some)} of {registered} poses are ambiguous (labels {', '.join(some)}): these objects agree about as well with the "
@@ -149,10 +149,10 @@ def say_ambiguous(views: list[View], unsure: np.ndarray, registered: int, run) -
         )
 
 
-def say_far_apart(views: list[View], poses: np.ndarray, run) -> None:
+def say_far_apart(views: list[InstanceView], poses: np.ndarray, run) -> None:
     """Say where the objects, at poses (N, 4, 4), show sides so different that their poses are
     uncertain whatever their scores."""
-    sides = seen_from(poses)
+    sides = viewing_directions(poses)
     if len(sides) < 2:
         return
     away = np.degrees(np.arccos(np.clip(sides @ sides.T, -1, 1)))
@@ -166,7 +166,9 @@ def say_far_apart(views: list[View], poses: np.ndarray, run) -> None:
     if gap > APART and len(sides) > 2:
         one, other = (
             ", ".join(
-                named(v).removeprefix("label ") for v, g in zip(views, group, strict=True) if g == n
+                instance_name(v).removeprefix("label ")
+                for v, g in zip(views, group, strict=True)
+                if g == n
             )
             for n in (0, 1)
         )
@@ -187,7 +189,7 @@ def widest_gap(away: np.ndarray) -> tuple[float, np.ndarray]:
     return float(gap), connected_components(tree, directed=False)[1]
 
 
-def named(view: View) -> str:
+def instance_name(view: InstanceView) -> str:
     """How messages call an instance."""
     return f"label {view.label}" + (f" in photo {view.photo + 1}" if view.photo else "")
 
@@ -231,13 +233,13 @@ def match_instances(shots: list[Shot], run, options: DuplicatesOptions, seed: in
     for i, j in links:
         count, turn = len(links[i, j].a), links[i, j].turn
         run.log.note(
-            f"{count} matches link {named(full[i])} and {named(full[j])}, turned by {turn:.0f} degrees"
+            f"{count} matches link {instance_name(full[i])} and {instance_name(full[j])}, turned by {turn:.0f} degrees"
         )
     out, together = [], set()
     for cluster in clusters:
         members = sorted(cluster)
         run.say(
-            f"matching links the instances {', '.join(named(full[k]).removeprefix('label ') for k in members)}"
+            f"matching links the instances {', '.join(instance_name(full[k]).removeprefix('label ') for k in members)}"
         )
         together |= {(i, j) for i in members for j in members if i < j}
         out += [
@@ -288,7 +290,9 @@ def adjusted_poses(matched: Matched, poses: np.ndarray, registered: np.ndarray, 
     return out
 
 
-def centred(views: list[View], poses: np.ndarray, registered: np.ndarray) -> np.ndarray:
+def centre_poses(
+    views: list[InstanceView], poses: np.ndarray, registered: np.ndarray
+) -> np.ndarray:
     """The poses in a frame whose unit sphere holds the object: its middle at the origin, its
     farthest point at 0.85."""
     chosen = [k for k in range(len(views)) if registered[k]]

@@ -37,15 +37,15 @@ from relit.errors import UserError
 from relit.fit.duplicates.azimuth_refinement import SCENES, turned_as_shown
 from relit.fit.duplicates.ground_paint import ground_as_shown
 from relit.fit.duplicates.indirect_light import ASLANT, HiddenLight, hidden_from
-from relit.fit.duplicates.lit_pile import lit_pile, surface_options
+from relit.fit.duplicates.lit_pile import lit_pile, pile_surface_options
 from relit.fit.duplicates.options import WITHOUT, DuplicatesOptions, options_for
-from relit.fit.duplicates.poses import all_views, named, poses_stage
+from relit.fit.duplicates.poses import all_views, instance_name, poses_stage
 from relit.fit.duplicates.scene import ground_colour, ground_reflectance, light_below
 from relit.fit.duplicates.shape import shape_stages
 from relit.fit.duplicates.vessels import body_axis
 from relit.fit.passes.first_material import PAINT, first_material
 from relit.fit.passes.surface import ALBEDO_START, fit_surface, start_surface
-from relit.fit.registration.instances.views import ANOTHER_PHOTO, View
+from relit.fit.registration.instances.views import ANOTHER_PHOTO, InstanceView
 from relit.fit.shape.inpaint import painted_over
 from relit.fit.shape.unseen import seen_faces
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
@@ -134,7 +134,7 @@ def surface_stage(
     """Material and light, in the scene frame: the world's axes, unit lengths of the object, the
     origin in the middle of the pile. What no instance shows is painted like what is next to it.
     Returns (and keeps) base_color, roughness, metallic, normal, environment and ground_colour."""
-    o = surface_options(options)
+    o = pile_surface_options(options)
     with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
         up = camera.world_from_camera[:3, :3] @ parts["plane"][1] if len(parts["plane"]) else None
         ground_level = ground_colour(shots[0][0], parts["plane"])
@@ -198,7 +198,7 @@ def shown_faces(pile: Mesh, which: np.ndarray, cameras: list[Camera]) -> np.ndar
 
 
 def turns_stage(
-    asset: Asset, mesh: Mesh, views: list[View], camera: Camera, parts, run, seed: int
+    asset: Asset, mesh: Mesh, views: list[InstanceView], camera: Camera, parts, run, seed: int
 ) -> np.ndarray:
     """Poses (K, 4, 4) of all instances as in `parts`, with those that were turned by guess as the
     photo shows them."""
@@ -229,7 +229,7 @@ def turns_stage(
             for view, a, b in zip(guessed, before, after, strict=True):
                 turn = rotation_angle(a[:3, :3].T @ b[:3, :3])
                 run.say(
-                    f"the object with {named(view)}, rendered, differs least from the photo when it is turned by {turn:.0f} degrees"
+                    f"the object with {instance_name(view)}, rendered, differs least from the photo when it is turned by {turn:.0f} degrees"
                 )
             poses[own] = after @ camera.world_from_camera
         stage.save("turns", poses=poses)

@@ -16,14 +16,14 @@ import numpy as np
 from relit.conventions import similarity
 from relit.fit.duplicates.options import DuplicatesOptions
 from relit.fit.duplicates.pose_passes import light_turns, related
-from relit.fit.duplicates.poses import named
+from relit.fit.duplicates.poses import instance_name
 from relit.fit.duplicates.vessels import body_axis
 from relit.fit.passes.pixels import PixelBank
 from relit.fit.passes.volume import VolumeModel
 from relit.fit.registration.instances.azimuth import others_of, turned_alike
 from relit.fit.registration.instances.outliers import LEAST, MOST, view_errors
 from relit.fit.registration.instances.recovery import galleries_of, sought_again
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import nearest_rotation
@@ -33,8 +33,8 @@ MANY = 20  # instances; the shape of more has no need of those that were left ou
 
 
 def joiners(
-    others: list[View],
-    views: list[View],
+    others: list[InstanceView],
+    views: list[InstanceView],
     poses: np.ndarray,
     after: np.ndarray,
     model: VolumeModel,
@@ -68,14 +68,14 @@ def joiners(
         if pose is not None:
             so = "was" if sure else "may have been"
             run.say(
-                f"the object with {named(view)} {so} found in the model of the others: it takes part in the next pass"
+                f"the object with {instance_name(view)} {so} found in the model of the others: it takes part in the next pass"
             )
             found[view.key] = pose
     return carried(found, poses, after)
 
 
 def seeker(
-    views: list[View], poses: np.ndarray, model: VolumeModel, level: float, seed: int
+    views: list[InstanceView], poses: np.ndarray, model: VolumeModel, level: float, seed: int
 ) -> Callable:
     """`sought_again` in the model of a pass; views, poses: that it was fitted to. level: median of
     their errors."""
@@ -85,16 +85,16 @@ def seeker(
         partial(galleries_of, model, float(np.linalg.norm(poses[0][:3, 3])))
     )  # they are large
 
-    def seek(view: View, **how):
+    def seek(view: InstanceView, **how):
         return sought_again(view, views[0], poses[0], model, level, turns, galleries, seed, **how)
 
     return seek
 
 
 def with_found(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
-    others: list[View],
+    others: list[InstanceView],
     on_axes: dict[int, np.ndarray],
     model: VolumeModel,
     bank: PixelBank,
@@ -113,11 +113,11 @@ def with_found(
         pose, sure = seek(view, on_axis=on_axes.get(view.key), turned=turned)
         if pose is not None and not sure:
             run.say(
-                f"note: the object with {named(view)} is placed on its axis; its turn about that is a guess"
+                f"note: the object with {instance_name(view)} is placed on its axis; its turn about that is a guess"
             )
         else:
             run.say(
-                f"the object with {named(view)} was {'' if sure else 'not '}found in the finished model of the others"
+                f"the object with {instance_name(view)} was {'' if sure else 'not '}found in the finished model of the others"
             )
         if pose is not None:
             (found if sure else vague).append((view, pose))
@@ -132,7 +132,7 @@ def with_found(
     )
 
 
-def turned_by_others(mesh: Mesh, views: list[View], poses: np.ndarray):
+def turned_by_others(mesh: Mesh, views: list[InstanceView], poses: np.ndarray):
     """What turns another view's pose about the axis of a body of revolution, as `sought_again` asks
     for it, by what `views` show; the pose as it is where they show no texture, and None where the
     mesh is no such body."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from relit.fit.duplicates.options import DuplicatesOptions
 from relit.fit.duplicates.vessels import body_axis
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.fit.shape.outlines import outline_misfit
 from relit.geometry.rounded import rounded
 from relit.scene import Mesh
@@ -21,7 +21,7 @@ OVAL = 0.6
 
 
 def made_round(
-    mesh: Mesh, views: list[View], poses: np.ndarray, run, options: DuplicatesOptions
+    mesh: Mesh, views: list[InstanceView], poses: np.ndarray, run, options: DuplicatesOptions
 ) -> Mesh:
     """The mesh, made round if it is a body of revolution; as it is if not, or if outlines say that
     it is oval. poses: (N, 4, 4)."""

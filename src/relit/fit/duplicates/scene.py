@@ -192,7 +192,7 @@ def distance_in(values: np.ndarray) -> Distance:
     return distance
 
 
-def spread(standing: list[np.ndarray], scene_from_photo: np.ndarray) -> np.ndarray:
+def spread_moves(standing: list[np.ndarray], scene_from_photo: np.ndarray) -> np.ndarray:
     """(N, 3) moves, scene frame, that carry instances standing at (4, 4) photo_from_object so far
     apart that none shadows another."""
     side = int(np.ceil(np.sqrt(len(standing))))
@@ -249,7 +249,7 @@ def scene_mesh(
 ) -> tuple[Mesh, np.ndarray]:
     """All instances and the ground as one mesh in the scene frame, and the radiance (V, 3) of its
     vertices. Faces with negative texture coordinates only block (the ground). moves: (N, 3) of
-    `spread`, where no instance, and no ground, is to shadow another; or None."""
+    `spread_moves`, where no instance, and no ground, is to shadow another; or None."""
     vertices, normals, faces, uvs, radiance, count = [], [], [], [], [], 0
     for k, pose in enumerate(standing):
         m = scene_from_photo @ pose

@@ -10,10 +10,10 @@ from functools import partial
 
 import numpy as np
 
-from relit.fit.duplicates.lit_pile import LitPile, lit_pile, surface_options
+from relit.fit.duplicates.lit_pile import LitPile, lit_pile, pile_surface_options
 from relit.fit.duplicates.mirrored_silhouettes import Symmetry
 from relit.fit.duplicates.options import DuplicatesOptions
-from relit.fit.duplicates.photo_motions import Scene
+from relit.fit.duplicates.photo_motions import SharedScene
 from relit.fit.duplicates.pose_passes import (
     JOINT,
     followed,
@@ -32,7 +32,7 @@ from relit.fit.duplicates.unseen_sides import closed_where_unseen, moved_along, 
 from relit.fit.duplicates.vessel_trial import vessel_of
 from relit.fit.duplicates.vessels import body_axis
 from relit.fit.passes.optimiser import NoStage
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.fit.shape.loose_parts import without_loose_parts
 from relit.geometry.atlas import unwrap
 from relit.geometry.mesh import extract_mesh
@@ -44,9 +44,9 @@ from relit.scene import Mesh
 
 def shape_stages(
     shots: list[Shot],
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
-    others: list[View],
+    others: list[InstanceView],
     on_axes: dict[int, np.ndarray],
     run,
     options: DuplicatesOptions,
@@ -118,7 +118,7 @@ def shape_stages(
 
 def placed_surface(
     values: np.ndarray,
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     follow,
     vague,
@@ -166,7 +166,7 @@ def placed_surface(
 
 
 def parts_of(
-    mesh: Mesh, views: list[View], scene: Scene, radiance: list[np.ndarray]
+    mesh: Mesh, views: list[InstanceView], scene: SharedScene, radiance: list[np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Which instances stand where, and which views show them, as `shape_stages` returns it.
     radiance: (V, 3) of the mesh's vertices in each view."""
@@ -185,9 +185,9 @@ def parts_of(
 
 def volume_stage(
     shots: list[Shot],
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
-    others: list[View],
+    others: list[InstanceView],
     on_axes: dict[int, np.ndarray],
     run,
     options: DuplicatesOptions,
@@ -234,7 +234,7 @@ def volume_stage(
 
 def vessel_stage(
     shots: list[Shot],
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     symmetry: Symmetry | None,
     run,
@@ -284,7 +284,7 @@ def vessel_stage(
             views,
             poses,
             lit,
-            surface_options(options),
+            pile_surface_options(options),
             run.say,
             seed,
             run.progress("mouths and lids"),
@@ -294,7 +294,7 @@ def vessel_stage(
 
 
 def built_again(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     symmetry: Symmetry | None,
     run,

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.fit.shape.unseen import face_pairs, part_areas, points_on, seen_points
 from relit.geometry.hull import distance_of
 from relit.geometry.mesh import extract_mesh, face_areas
@@ -45,7 +45,7 @@ BLEND = 1.5  # grid steps, standard deviation of what smooths the new surface
 
 
 def closed_where_unseen(
-    values: np.ndarray, views: list[View], poses: np.ndarray
+    values: np.ndarray, views: list[InstanceView], poses: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """(signed distance (n, n, n), share of the volume that is gone) of the shape `values` (n, n, n,
     negative inside) with the sides that no view shows closed over what is seen; as it is where
@@ -75,7 +75,7 @@ def closed_where_unseen(
     return np.maximum(values, gaussian_filter(-distance_of(gone), BLEND)).astype(np.float32), share
 
 
-def seen_in(mesh: Mesh, views: list[View], poses: np.ndarray) -> np.ndarray:
+def seen_in(mesh: Mesh, views: list[InstanceView], poses: np.ndarray) -> np.ndarray:
     """(F,) bool: faces that some view shows in front, in pixels of the object; with a smooth rim
     and without small parts."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)

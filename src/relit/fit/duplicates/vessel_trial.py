@@ -27,7 +27,7 @@ from relit.fit.passes.surface import (
     fit_surface,
     start_surface,
 )
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import rasterise_atlas
 from relit.geometry.mesh import extract_mesh
@@ -51,7 +51,7 @@ PIXELS = 200  # of them must meet a mouth that is asked
 
 def vessel_of(
     values: np.ndarray,
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     lit: Callable[[Mesh], LitPile],
     options: SurfaceOptions,
@@ -80,16 +80,16 @@ def vessel_of(
         hollows = [hollowed(values, shape, axis, end, raised) for raised in FLOORS]
         if any(h is None for h in hollows):
             continue
-        closed = closed or Body.of(shape, lit, o)
+        closed = closed or TrialShape.of(shape, lit, o)
         lid = closed.texels_of(lid_of(closed.mesh, axis, end, 2 / (len(values) - 1)))
-        if met_by(closed, lid, o, seed) < PIXELS:
+        if pixels_on_texels(closed, lid, o, seed) < PIXELS:
             continue
         if not fitted:
             closed.fit(o, stage, seed)
             fitted = True
         changes: list[float] = []
         for trial in hollows:
-            opened = Body.of(trial, lit, o)
+            opened = TrialShape.of(trial, lit, o)
             opened.fit(o, stage, seed)
             changes.append(change_of_error(closed, opened, lid, o, seed))
             if changes[0] > 1 - GAIN:
@@ -120,7 +120,7 @@ def lowest_of(changes: list[float]) -> float:
 
 
 @dataclass
-class Body:
+class TrialShape:
     """A shape that is tried. mesh: of the object, with its atlas. face: (S, S), in which one each
     texel lies, -1 for none. pile: of its instances. model: of the surface pass."""
 
@@ -130,11 +130,11 @@ class Body:
     model: SurfaceModel
 
     @staticmethod
-    def of(values: np.ndarray, lit: Callable[[Mesh], LitPile], o: SurfaceOptions) -> Body:
+    def of(values: np.ndarray, lit: Callable[[Mesh], LitPile], o: SurfaceOptions) -> TrialShape:
         mesh, _ = unwrap(extract_mesh(redistance(values), faces=FACES), o.texture)
         pile, face = lit(mesh), rasterise_atlas(mesh, o.texture)[0]
         model = start_surface(np.ones((*face.shape, 3), np.float32), face >= 0, pile.level, o)
-        return Body(mesh, face, pile, model)
+        return TrialShape(mesh, face, pile, model)
 
     def fit(self, o: SurfaceOptions, stage, seed: int) -> None:
         """A few steps of the surface pass, from one grey."""
@@ -168,20 +168,22 @@ def lid_of(mesh: Mesh, axis: Axis, end: End, voxel: float) -> np.ndarray:
     )
 
 
-def meets(points, texels: np.ndarray) -> np.ndarray:
+def on_texels(points, texels: np.ndarray) -> np.ndarray:
     """(N,) bool: which points lie on texels (S, S) bool."""
     size = len(texels)
     u, v = np.clip((np.array(points.uv) * size).astype(int), 0, size - 1)
     return np.array(points.valid) & texels[v, u]
 
 
-def met_by(body: Body, texels: np.ndarray, o: SurfaceOptions, seed: int) -> int:
+def pixels_on_texels(body: TrialShape, texels: np.ndarray, o: SurfaceOptions, seed: int) -> int:
     """How many pixels of all batches meet texels (S, S) bool."""
-    return sum(int(meets(body.drawn(batch, o, seed)[1], texels).sum()) for batch in range(BATCHES))
+    return sum(
+        int(on_texels(body.drawn(batch, o, seed)[1], texels).sum()) for batch in range(BATCHES)
+    )
 
 
 def change_of_error(
-    closed: Body, opened: Body, lid: np.ndarray, o: SurfaceOptions, seed: int
+    closed: TrialShape, opened: TrialShape, lid: np.ndarray, o: SurfaceOptions, seed: int
 ) -> float:
     """What the error of the pixels that meet the lid, texels (S, S) bool of the closed one, is
     multiplied by when it is opened."""
@@ -191,7 +193,7 @@ def change_of_error(
             closed.drawn(number, o, seed),
             opened.drawn(number, o, seed),
         )
-        met = meets(points, lid) & np.array(inside.valid)
+        met = on_texels(points, lid) & np.array(inside.valid)
         sums += (
             closed.errors(batch, points, rng, o)[met].sum(),
             opened.errors(same, inside, other, o)[met].sum(),

@@ -20,7 +20,7 @@ import trimesh
 from scipy.ndimage import binary_dilation, binary_propagation, grey_opening
 
 from relit.fit.duplicates.scene import distance_in
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.fit.shape.hollows import small_pixels, small_size
 from relit.geometry.revolution_axis import Axis, revolution_axis
 from relit.geometry.sdf import node_positions, redistance
@@ -57,7 +57,7 @@ def body_axis(mesh: Mesh) -> Axis | None:
 
 
 def lowest_cut(
-    values: np.ndarray, heights: np.ndarray, views: list[View], cameras: list[Camera]
+    values: np.ndarray, heights: np.ndarray, views: list[InstanceView], cameras: list[Camera]
 ) -> float:
     """The height above which all can be taken away so that the silhouettes lose LOST of their area,
     of what the body covers. values,
@@ -82,7 +82,7 @@ def lowest_cut(
 
 
 def ends_of(
-    values: np.ndarray, axis: Axis, views: list[View], cameras: list[Camera]
+    values: np.ndarray, axis: Axis, views: list[InstanceView], cameras: list[Camera]
 ) -> tuple[np.ndarray, list[End]]:
     """(distances of the body, both ends cut off square as deep as its silhouettes let them be; the
     ends)."""

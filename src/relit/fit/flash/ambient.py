@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from relit.fit.flash.features import ALPHA, FlashView, capture_features, seen_from
+from relit.fit.flash.features import ALPHA, FlashView, capture_features, flash_views_of
 from relit.fit.passes.pixels import PixelBank
 from relit.geometry.bake import fill_gutters
 from relit.geometry.sdf import node_positions
@@ -110,7 +110,9 @@ def find_ambient(
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
     with dr.suspend_grad():
         for view, camera in enumerate(cameras):
-            seen = seen_from(bank, camera, view, traceable, point, normal, flash, lit_only=True)
+            seen = flash_views_of(
+                bank, camera, view, traceable, point, normal, flash, lit_only=True
+            )
             falls = dr.select(seen.ok, seen.cos_l * seen.inverse, 0)
             straight[view], entering[view] = (
                 np.array(falls),

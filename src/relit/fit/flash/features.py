@@ -50,7 +50,7 @@ class FlashView:
 
 
 @dataclass(frozen=True)
-class Found:
+class TexelEvidence:
     """albedo: (N, 3) diffuse, for the given intensity. seen: (N,) bool, enough photos. features:
     (N, 4) float32."""
 
@@ -68,7 +68,7 @@ def capture_features(
     coat: Coat,
     flash: FlashView,
     ambient: Any = None,
-) -> Found:
+) -> TexelEvidence:
     """The features of N surface points x with normals n, both (N, 3), unit frame. ambient:
     fit.flash_ambient.Ambient, light from the surface itself, none where None."""
     values = np.full((bank.views, len(x), 3), np.nan, np.float16)
@@ -95,7 +95,9 @@ def capture_features(
                 v[~aside[:, part]] = np.nan
             albedo[part] = np.nanquantile(v, quantile, axis=0) if len(part) else 0
     shown = srgb_from_linear(np.clip(albedo, 0, 1.5))
-    return Found(albedo, seen, np.concatenate([shown, np.zeros((len(x), 1))], 1).astype(np.float32))
+    return TexelEvidence(
+        albedo, seen, np.concatenate([shown, np.zeros((len(x), 1))], 1).astype(np.float32)
+    )
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class Seen:
     inverse: Any
 
 
-def seen_from(
+def flash_views_of(
     bank: PixelBank,
     camera: Camera,
     view: int,
@@ -170,7 +172,7 @@ def shading_free(
     """The photo's value at the points over what a white diffuse base would show there, (N, 3), NaN
     where the photo does not show them; and the cosine of the viewer's direction (N,). around: (N,
     3) irradiance from the surface itself over the flash's intensity, or 0."""
-    seen = seen_from(bank, camera, view, mesh, x, n, flash)
+    seen = flash_views_of(bank, camera, view, mesh, x, n, flash)
     ok, cos_v, cos_l = (
         seen.ok & (seen.cos_v > LEAST_COSINE) & (seen.cos_l > LEAST_COSINE),
         seen.cos_v,
@@ -222,7 +224,7 @@ def network_features(
         ]
 
     def places(view: int):
-        seen = seen_from(bank, cameras[view], view, mesh, point, normal, flash)
+        seen = flash_views_of(bank, cameras[view], view, mesh, point, normal, flash)
         return (
             np.array(seen.column),
             np.array(seen.row),

@@ -24,9 +24,9 @@ from relit.fit.passes.losses import display_weight
 from relit.fit.passes.optimiser import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.passes.pixels import PixelBank, draw_pixels, saturated_at, well_exposed
 from relit.fit.passes.preview import surface_preview
-from relit.fit.passes.surface import drawn_points, dual_values, neighbours
+from relit.fit.passes.surface import drawn_points, dual_values, neighbour_points
 from relit.lighting.flash import light_position
-from relit.materials.plastic_field import PlasticField, plastic_at, project
+from relit.materials.plastic_field import PlasticField, plastic_at, project_plastic
 from relit.materials.rough_plastic import Coat, Plastic, base_radiance
 from relit.rendering.transport import Points, TraceableMesh, bent_normal
 from relit.rendering.transport_flash import direct, indirect, lit
@@ -115,7 +115,7 @@ def fit_flash_surface(
     field, o = model.field, options
     even = calm_weights(bank, cameras, o.edge)
     beginning = PlasticField(field.size, mi.Float(field.diffuse), field.lobe, field.slope)
-    brightest = brightness(beginning)
+    brightest = brightest_albedo(beginning)
     first = 0
     saved = stage.load("checkpoint")
     if saved:
@@ -151,8 +151,8 @@ def fit_flash_surface(
         )
         valid, calm = points.valid, dr.gather(mi.Float, even, batch.pixel)
         dr.eval(batch.view, calm)
-        near = neighbours(mesh, points, o.reach, rng)
-        close = neighbours(mesh, points, o.slope_reach, rng)
+        near = neighbour_points(mesh, points, o.reach, rng)
+        close = neighbour_points(mesh, points, o.slope_reach, rng)
         dr.eval(near, close, rng)
         with dr.suspend_grad():
             flash = light_position(bank.cameras, batch.view, offset_of(model.offset))
@@ -186,7 +186,7 @@ def fit_flash_surface(
             )
             fit += dr.opaque(mi.Float, o.patches) * alike
         bend = slope.x * points.t + slope.y * points.b
-        prior = material_prior(model, plastic, points, near, valid, o) + slope_prior(
+        prior = gloss_prior(model, plastic, points, near, valid, o) + flash_slope_prior(
             field, bend, close, valid, o
         )
         offset_z = dr.abs(dr.gather(mi.Float, model.offset, mi.UInt32(2)))
@@ -218,7 +218,7 @@ def fit_flash_surface(
                     share(points, batch, plastic, n, position, intensity, seen, calm, sigma, decay)
         if i % RESCALE == RESCALE - 1:
             rescale(model, brightest)
-        project(field)
+        project_plastic(field)
         dr.eval(model.offset, model.log_intensity, field.diffuse, field.lobe, field.slope)
         return {"colour": fit}
 
@@ -263,7 +263,7 @@ def fit_flash_surface(
     return model
 
 
-def brightness(field: PlasticField) -> float:
+def brightest_albedo(field: PlasticField) -> float:
     """The 99th percentile over texels of the brightest channel of the diffuse albedo."""
     return float(np.percentile(np.array(field.diffuse).reshape(-1, 4)[:, :3].max(1), 99))
 
@@ -272,7 +272,7 @@ def rescale(model: FlashModel, brightest: float) -> None:
     """Albedos and intensity changed by a factor and its inverse, which direct light does not
     notice, so that the diffuse albedo is as bright as it was. What inter-reflection there is rests
     on that factor; it must not drift with chance along a valley so flat."""
-    factor = dr.opaque(mi.Float, brightness(model.field) / max(brightest, 1e-6))
+    factor = dr.opaque(mi.Float, brightest_albedo(model.field) / max(brightest, 1e-6))
 
     def specular(lobe):
         return dr.select(dr.arange(mi.UInt32, dr.width(lobe)) % 2 == 0, lobe / factor, lobe)
@@ -359,7 +359,7 @@ def robust_weight(difference, target, sigma):
     return dr.rcp(dr.square(1 + (far.x + far.y + far.z) / (3 * dr.square(sigma))))
 
 
-def features_at(model: FlashModel, uv, active):
+def texel_features(model: FlashModel, uv, active):
     """Bilinear look-up of the features (Vector4f), detached."""
     from relit.materials.field import texels_at
 
@@ -369,14 +369,14 @@ def features_at(model: FlashModel, uv, active):
     return dr.detach(out)
 
 
-def material_prior(
+def gloss_prior(
     model: FlashModel, plastic, points: Points, near: Points, valid, o: FlashSurfaceOptions
 ):
     """Neighbours of like features share specular albedo and alpha; alpha beyond .5 is rare (PIR Eq.
     9, L_smooth and L_α)."""
     there, _ = plastic_at(model.field, near.uv, near.valid)
     distance = dr.squared_norm(
-        features_at(model, near.uv, near.valid) - features_at(model, points.uv, valid)
+        texel_features(model, near.uv, near.valid) - texel_features(model, points.uv, valid)
     )
     alike = dr.select(near.valid & valid, dr.exp(-distance / (2 * o.width**2)), 0)
     change = dr.abs(there.specular - plastic.specular) + 2 * dr.abs(there.alpha - plastic.alpha)
@@ -384,7 +384,7 @@ def material_prior(
     return dr.opaque(mi.Float, o.smooth) * dr.mean(alike * change) + o.alpha_range * dr.mean(wide)
 
 
-def slope_prior(field: PlasticField, bend, close: Points, valid, o: FlashSurfaceOptions):
+def flash_slope_prior(field: PlasticField, bend, close: Points, valid, o: FlashSurfaceOptions):
     """Normal maps are small, and change little between neighbours. bend: Vector3f, slope.x t +
     slope.y b at the points."""
     _, slope = plastic_at(field, close.uv, close.valid)

@@ -61,7 +61,7 @@ class Exchange:
             + 1e-6
         )
         dr.eval(light)
-        self.share = shares(self._cosines, self._hats, light, self.count)
+        self.share = basis_shares(self._cosines, self._hats, light, self.count)
         dr.eval(self.share)
 
     def step(self, colour, log_light, colour_gradient, light_gradient, rate: float, metallic=None):
@@ -102,7 +102,7 @@ class Exchange:
 
 
 @dr.syntax
-def shares(cosines, hats, light, count):
+def basis_shares(cosines, hats, light, count):
     """ψ_k(n), Float [normals * count], for the light (Float, a value for each direction of the
     table). cosines: Float [normals * directions], hats: Float [directions * count]. Each lane sums
     over the directions: no larger array is made, and none leaves the device."""

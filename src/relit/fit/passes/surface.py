@@ -58,7 +58,7 @@ class SurfaceOptions:
     roughness. smooth_roughness,
     smooth_metallic, smooth_colour: weights of differences between similar neighbours, up to
     similarity_reach (unit frame) apart and similarity_width in base colour; smooth_shade: power of
-    `brightness` in smooth_colour. scale_power: see `common_scale`. metallic_binary,
+    `relative_irradiance` in smooth_colour. scale_power: see `common_scale`. metallic_binary,
     metallic_sparse: of m (1 - m), and of the distance of m from the side that a place began on, 0
     or 1. bright: of base colour beyond WHITE, squared. light_smooth: total variation of the log
     radiance, of its tint light_tint times that more. light_cells: it moves by `LightSteps`.
@@ -227,8 +227,8 @@ def fit_surface(
             before(i, options.steps, material, environment, seed)
         batch, points = drawn_points(bank, mesh, rng, count)
         valid = points.valid
-        near = neighbours(mesh, points, options.similarity_reach, rng)
-        close = neighbours(mesh, points, options.slope_reach, rng)
+        near = neighbour_points(mesh, points, options.similarity_reach, rng)
+        close = neighbour_points(mesh, points, options.slope_reach, rng)
         dr.eval(near, close, rng)
         shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (count - 1))
         with dr.suspend_grad():
@@ -259,7 +259,7 @@ def fit_surface(
         points.n = bent_normal(points, slope)
         a, b = reflected(points, lights, surface, environment)
         fit = dual_loss(a, b, batch.rgb, valid, saturated_at(bank, batch.view))
-        lit = brightness(batch.rgb, surface.base, valid, options.smooth_shade)
+        lit = relative_irradiance(batch.rgb, surface.base, valid, options.smooth_shade)
         level = common_scale(surface, valid, options.scale_power)
         prior = material_prior(
             material, surface, near, valid, level, options, colour_smoothing * lit, side
@@ -369,7 +369,7 @@ def dual_values(a, b, target, saturated=SATURATED):
     return (value.x + value.y + value.z) / 3
 
 
-def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points:
+def neighbour_points(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points:
     """For each point another one on the same stretch of surface, up to `reach` away (log-uniform in
     its tangent plane). Detached."""
     with dr.suspend_grad():
@@ -380,7 +380,7 @@ def neighbours(mesh: TraceableMesh, points: Points, reach: float, rng) -> Points
         return first_hits(mesh, points.x + offset + points.n * r, -points.n)
 
 
-def brightness(rgb, base, valid, power: float):
+def relative_irradiance(rgb, base, valid, power: float):
     """How much light arrives at each point, 1 on average (Float): what is in the shade shows its
     colour less, and is smoothed less."""
     arriving = mi.luminance(rgb) / dr.maximum(mi.luminance(dr.detach(base)), 0.05)

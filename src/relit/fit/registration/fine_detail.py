@@ -38,7 +38,7 @@ ROUNDS = 3  # each photo that comes right makes clearer what the others should s
 
 
 @dataclass(frozen=True)
-class Surface:
+class DetailPoints:
     """points, normals: (N, 3) unit frame. scene: for ray queries."""
 
     points: np.ndarray
@@ -54,9 +54,9 @@ class Picture:
     depth: np.ndarray
 
 
-def surface_of(mesh: Mesh) -> Surface:
+def surface_of(mesh: Mesh) -> DetailPoints:
     """The vertices of a mesh as places to look at."""
-    return Surface(
+    return DetailPoints(
         np.asarray(mesh.vertices, np.float64),
         np.asarray(mesh.normals, np.float64),
         build_geometry(mesh),
@@ -81,7 +81,7 @@ def detail_of(rgb: np.ndarray, mask: np.ndarray) -> Picture:
     )
 
 
-def seen(surface: Surface, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def seen(surface: DetailPoints, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """(pixel indices (2, N) as (row, column), which of the points (N,) the camera sees), in front
     of it and not too slanted."""
     photo_from_world = np.linalg.inv(camera.world_from_camera)
@@ -102,7 +102,7 @@ def seen(surface: Surface, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     ) & ~blocked
 
 
-def laid_on(surface: Surface, camera: Camera, picture: Picture) -> np.ndarray:
+def photo_values_at(surface: DetailPoints, camera: Camera, picture: Picture) -> np.ndarray:
     """(N,) what the photo shows at the points; NaN where it does not see them."""
     at, visible = seen(surface, camera)
     inside = map_coordinates(picture.depth, at, order=1, mode="constant") > BORDER * max(
@@ -119,7 +119,7 @@ def expected(laid: np.ndarray, least: int = LEAST_PHOTOS) -> np.ndarray:
     return out
 
 
-def likeness(surface: Surface, camera: Camera, picture: Picture, shown: np.ndarray) -> float:
+def likeness(surface: DetailPoints, camera: Camera, picture: Picture, shown: np.ndarray) -> float:
     """The correlation of what the photo shows from this pose with `shown` (N,), at the best shift
     of the picture; -1 where too little is seen."""
     at, visible = seen(surface, camera)
@@ -147,7 +147,7 @@ def likeness(surface: Surface, camera: Camera, picture: Picture, shown: np.ndarr
 
 
 @dataclass(frozen=True)
-class Told:
+class DetailVerdict:
     """moved: photos (by number) that show more of what the others show from another camera than
     their own, and that camera. as_well: photos that show about as much of it from another camera,
     and that one."""
@@ -156,13 +156,13 @@ class Told:
     as_well: dict[int, Camera]
 
 
-def told_apart(
-    surface: Surface,
+def compare_detail(
+    surface: DetailPoints,
     pictures: Sequence[Picture],
     cameras: Sequence[Camera],
     choices: Sequence[tuple[int, Camera]],
     laid=None,
-) -> Told:
+) -> DetailVerdict:
     """What fine detail says of the places that photos may have been taken from.
 
     choices: (photo, another camera it may have been). laid: (P, N) what photos with known cameras
@@ -173,7 +173,9 @@ def told_apart(
     for _ in range(ROUNDS if laid is None else 1):
         shows = laid
         if laid is None:
-            shows = np.array([laid_on(surface, c, p) for c, p in zip(now, pictures, strict=True)])
+            shows = np.array(
+                [photo_values_at(surface, c, p) for c, p in zip(now, pictures, strict=True)]
+            )
         better: dict[int, Camera] = {}
         as_well = {}
         for i in sorted({i for i, _ in choices}):
@@ -193,11 +195,11 @@ def told_apart(
         moved |= better
         if not better:
             break
-    return Told(moved, as_well)
+    return DetailVerdict(moved, as_well)
 
 
-def borne_out(
-    surface: Surface, pictures: Sequence[Picture], cameras: Sequence[Camera]
+def detail_correlation(
+    surface: DetailPoints, pictures: Sequence[Picture], cameras: Sequence[Camera]
 ) -> np.ndarray:
     """(P,) how much of what each photo shows is what the others show there, as `likeness`; -1 for a
     photo that shares too little with any.
@@ -206,7 +208,9 @@ def borne_out(
     places have .37 to .91, photos in wrong places .31 and .38 where one side is like another, and
     at most .2 where nothing fits.
     """
-    laid = np.array([laid_on(surface, c, p) for c, p in zip(cameras, pictures, strict=True)])
+    laid = np.array(
+        [photo_values_at(surface, c, p) for c, p in zip(cameras, pictures, strict=True)]
+    )
     least = min(LEAST_PHOTOS, max(1, (len(laid) - 1) // 4))
     shown = [expected(np.delete(laid, i, 0), least) for i in range(len(laid))]
     return np.array([likeness(surface, *of) for of in zip(cameras, pictures, shown, strict=True)])

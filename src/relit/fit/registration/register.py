@@ -322,13 +322,13 @@ def detail(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
     level = rgb.mean(-1) / np.maximum(mask, 0.05) * inside
     usual = np.maximum(level.sum((1, 2)) / count, 1e-4)
     bright = np.log(level / usual[:, None, None] + 0.1) * inside
-    around = blurred(bright) / np.maximum(blurred(inside), 1e-3)
+    around = smooth_pictures(bright) / np.maximum(smooth_pictures(inside), 1e-3)
     fine = (bright - around) * inside
     deviation = np.sqrt((fine**2).sum((1, 2)) / count)
     return np.clip(fine / (deviation[:, None, None] + 0.03), -2.5, 2.5).astype(np.float32)
 
 
-def blurred(pictures: np.ndarray) -> np.ndarray:
+def smooth_pictures(pictures: np.ndarray) -> np.ndarray:
     """(N, S, S) smoothed by FINE pixels."""
     size = 2 * round(4 * FINE) + 1
     return np.stack(

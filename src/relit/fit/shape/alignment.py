@@ -34,13 +34,13 @@ from relit.fit.shape.outlines import (
     by_motion,
     follow_with_poses,
     laplacian,
-    moved,
+    moved_along_normals,
     outline_of,
     precision,
     spread_of,
 )
 from relit.fit.shape.sparse import solved_symmetric
-from relit.fit.shape.texture_shifts import Shifts, misfit, shares, texture_shifts
+from relit.fit.shape.texture_shifts import Shifts, flow_weights, shift_quantile, texture_shifts
 from relit.geometry.se3 import turns_apart
 from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
@@ -100,17 +100,17 @@ def follow_views(
     outlined, poses = follow_with_poses(mesh, cameras, masks, known, rounds)
     start = with_poses(cameras, poses)
     shifts = texture_shifts(outlined, start, pictures, masks)
-    before = misfit(shifts)
+    before = shift_quantile(shifts)
     if before <= EXACT:
         return outlined, poses, None
     placed, left = by_textures(outlined, start, shifts, pictures, masks)
-    if misfit(left, NEARLY_ALL) < min(SHARP, WHOLLY * misfit(shifts, NEARLY_ALL)):
+    if shift_quantile(left, NEARLY_ALL) < min(SHARP, WHOLLY * shift_quantile(shifts, NEARLY_ALL)):
         found, placed, left = by_both(outlined, placed, left, pictures, masks, known, BOTH)
     else:  # not the labels, then: the shape
         found, placed, left = by_both(
             outlined, start, shifts, pictures, masks, known, SOFT, YIELDING
         )
-    after = misfit(left)
+    after = shift_quantile(left)
     if not 0 < after < before:
         return outlined, poses, None
     return found, np.array([c.world_from_camera for c in placed]), (before, after)
@@ -127,7 +127,7 @@ def by_textures(
         before = placed
         placed = solved(mesh, placed, texture_rows(shifts, placed), still=True)[1]
         shifts = texture_shifts(mesh, placed, pictures, masks)
-        if settled(before, placed):
+        if has_converged(before, placed):
             break
     return placed, shifts
 
@@ -155,12 +155,12 @@ def by_both(
         )
         mesh, placed = solved(mesh, placed, rows + outlines, stiffness=softer or (STIFF, REST))
         shifts = texture_shifts(mesh, placed, pictures, masks)
-        if settled(before, placed):
+        if has_converged(before, placed):
             break
     return mesh, placed, shifts
 
 
-def settled(before: list[Camera], after: list[Camera]) -> bool:
+def has_converged(before: list[Camera], after: list[Camera]) -> bool:
     """Whether a round has turned no camera by more than SETTLED."""
     turns = turns_apart(
         *(np.array([c.world_from_camera for c in cameras]) for cameras in (before, after))
@@ -199,10 +199,10 @@ def tangents(normals: np.ndarray) -> np.ndarray:
 def texture_rows(shifts: list[Shifts], cameras: list[Camera]) -> list[Rows]:
     """Two equations for each place, x and y."""
     spread = max(
-        1.48 * misfit(shifts) / 1.18, FAINTEST
+        1.48 * shift_quantile(shifts) / 1.18, FAINTEST
     )  # of one coordinate: the median length is 1.18 deviations
     out = []
-    for s, share in zip(shifts, shares(shifts), strict=True):
+    for s, share in zip(shifts, flow_weights(shifts), strict=True):
         here, turn_here = projection(cameras[s.view], s.point)
         there, turn_there = projection(cameras[s.other], s.point)
         t = tangents(s.normal)
@@ -296,15 +296,19 @@ def solved(
             ]
         )
     step = solved_symmetric(normal + damping, a.T @ (trust * shift))
-    placed = [turned(c, s) for c, s in zip(cameras, step[: 6 * n].reshape(n, 6), strict=True)]
+    placed = [
+        camera_after_motion(c, s) for c, s in zip(cameras, step[: 6 * n].reshape(n, 6), strict=True)
+    ]
     return (
         mesh
         if still
-        else moved(mesh, np.clip(step[6 * n :], -FARTHEST / pixels, FARTHEST / pixels))
+        else moved_along_normals(
+            mesh, np.clip(step[6 * n :], -FARTHEST / pixels, FARTHEST / pixels)
+        )
     ), placed
 
 
-def turned(camera: Camera, step: np.ndarray) -> Camera:
+def camera_after_motion(camera: Camera, step: np.ndarray) -> Camera:
     """The camera after a motion (6,) of what it sees, see `projection`; a turn of more than TURN
     shortens it."""
     shorter = min(1.0, TURN / max(float(np.linalg.norm(step[:3])), 1e-12))

@@ -86,7 +86,7 @@ def open_hollows(
 
     def fitted(v: np.ndarray):
         model = briefly_fitted(bank, start(v), o, stage, seed)
-        return dense_values(model.grid), *surface_error(bank, model, o, seed)
+        return dense_values(model.grid), *error_near_nodes(bank, model, o, seed)
 
     shape, error, where = fitted(values)
     for _ in range(o.rounds):
@@ -121,7 +121,7 @@ def without(values: np.ndarray, hollows: np.ndarray | None) -> np.ndarray:
     return values if hollows is None else np.maximum(values, -resample(hollows, values.shape[0]))
 
 
-def surface_error(bank: PixelBank, model: VolumeModel, o: HollowOptions, seed: int):
+def error_near_nodes(bank: PixelBank, model: VolumeModel, o: HollowOptions, seed: int):
     """(mean error, (n, n, n) mean error of the rays whose surface point is near each node, NaN
     where there are none)."""
     n = o.nodes

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from relit.errors import EXIT_FAILED, UserError
-from relit.fit.shape.outlines import trace
+from relit.fit.shape.outlines import trace_rays
 from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
@@ -32,7 +32,10 @@ def mask_overlaps(mesh: Mesh, cameras: Sequence[Camera], masks: Sequence[np.ndar
             a.ravel()
             for a in np.mgrid[step // 2 : mask.shape[0] : step, step // 2 : mask.shape[1] : step]
         )
-        shown, inside = np.isfinite(trace(scene, camera, x + 0.5, y + 0.5)[0]), mask[y, x] > 0.5
+        shown, inside = (
+            np.isfinite(trace_rays(scene, camera, x + 0.5, y + 0.5)[0]),
+            mask[y, x] > 0.5,
+        )
         either = np.count_nonzero(shown | inside)
         out.append(np.count_nonzero(shown & inside) / either if either else 1.0)
     return np.array(out)

@@ -66,7 +66,7 @@ def follow_outlines(
     tracing and solving."""
     for _ in range(rounds):
         scene = build_geometry(mesh)
-        mesh = moved(
+        mesh = moved_along_normals(
             mesh,
             solve(
                 mesh, [outline_of(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
@@ -101,7 +101,7 @@ def follow_with_poses(
                 for c, outline in zip(cameras, found, strict=True)
             ]
         if not still:
-            mesh = moved(
+            mesh = moved_along_normals(
                 mesh,
                 solve(
                     mesh,
@@ -169,7 +169,7 @@ def precision(shift: np.ndarray, spread: float | None = None, far: float = FAR) 
     return 1 / (spread * (1 + (shift / far) ** 2)) ** 2
 
 
-def moved(mesh: Mesh, distance: np.ndarray) -> Mesh:
+def moved_along_normals(mesh: Mesh, distance: np.ndarray) -> Mesh:
     """The mesh with its vertices moved by `distance` (V,) along their normals, which turn as the
     faces do."""
     before = vertex_normals(mesh)
@@ -224,7 +224,7 @@ def covered_by(mesh: Mesh, scene, camera: Camera, mask: np.ndarray):
     y, x = (part.ravel() for part in np.mgrid[top:bottom, left:right])
     covered = np.zeros(mask.shape, np.uint8)
     covered[top:bottom, left:right] = np.isfinite(
-        trace(scene, camera, x + 0.5, y + 0.5)[0]
+        trace_rays(scene, camera, x + 0.5, y + 0.5)[0]
     ).reshape(bottom - top, right - left)
     edge = cv2.dilate(covered, CROSS) - cv2.erode(covered, CROSS)
     y, x = np.nonzero(cv2.dilate(edge, CROSS) | (np.abs(mask - covered) > 0.02))
@@ -232,7 +232,7 @@ def covered_by(mesh: Mesh, scene, camera: Camera, mask: np.ndarray):
     at = np.stack(
         np.broadcast_arrays(x[:, None, None] + part, y[:, None, None] + part[:, None]), -1
     ).reshape(-1, 2)
-    depth, face, uv = trace(scene, camera, *at.T)
+    depth, face, uv = trace_rays(scene, camera, *at.T)
     hit = np.isfinite(depth)
     coverage = covered.astype(np.float32)
     coverage[y, x] = hit.reshape(-1, SUB * SUB).mean(1)
@@ -273,7 +273,7 @@ def box_of(mesh: Mesh, camera: Camera, mask: np.ndarray) -> tuple[int, int, int,
     return *low, *high
 
 
-def trace(scene, camera: Camera, x: np.ndarray, y: np.ndarray):
+def trace_rays(scene, camera: Camera, x: np.ndarray, y: np.ndarray):
     """Distance (infinite where nothing is met), face and its barycentrics (N, 2) along the rays
     through pixel positions."""
     if len(x) == 0:

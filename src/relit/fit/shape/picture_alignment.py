@@ -14,7 +14,7 @@ BLUR = 1.0  # pixels, standard deviation: of both pictures while they are laid o
 DAMPING = 1e-6  # of the mean curvature, for pictures that do not tell some motion
 
 
-def laid_on(picture: np.ndarray, photo: np.ndarray, where: np.ndarray) -> np.ndarray:
+def align_picture(picture: np.ndarray, photo: np.ndarray, where: np.ndarray) -> np.ndarray:
     """The similarity (2, 3), photo's pixels to the picture's, with which a picture (h, w, 3)
     differs least from a photo (h, w, 3) in the pixels `where` (h, w) bool; from one that is off by
     a pixel or two (Lucas & Kanade 1981, in all channels at once)."""

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from relit.conventions import srgb_from_linear
-from relit.fit.shape.outlines import trace
+from relit.fit.shape.outlines import trace_rays
 from relit.fit.shape.unseen import clear, facing, sight_rays
 from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
@@ -95,8 +95,8 @@ def texture_shifts(
     scene = build_geometry(mesh)
     shown = [shown_by(mesh, scene, c, m) for c, m in zip(cameras, masks, strict=True)]
     tint = tint_of(pictures, masks)
-    channels = [channels_of(p, tint) for p in pictures]
-    pairs = [(i, j, shown[i], masks[j]) for i, j in neighbours(cameras)]
+    channels = [display_channels(p, tint) for p in pictures]
+    pairs = [(i, j, shown[i], masks[j]) for i, j in neighbouring_views(cameras)]
     return shifts_between(mesh, scene, pairs, cameras, channels)
 
 
@@ -136,20 +136,20 @@ def threads_of_pairs():
         cv2.setNumThreads(before)
 
 
-def misfit(shifts: list[Shifts], part: float = 0.5) -> float:
+def shift_quantile(shifts: list[Shifts], part: float = 0.5) -> float:
     """Length in pixels that so large a part of the shifts does not exceed, by what they count (see
-    `shares`), or their median; 0 where there are none."""
+    `flow_weights`), or their median; 0 where there are none."""
     if not shifts:
         return 0.0
     length, weight = (
         np.concatenate([np.linalg.norm(s.shift, axis=1) for s in shifts]),
-        np.concatenate(shares(shifts)),
+        np.concatenate(flow_weights(shifts)),
     )
     order = np.argsort(length)
     return float(length[order][np.searchsorted(np.cumsum(weight[order]), part * weight.sum())])
 
 
-def shares(shifts: list[Shifts]) -> list[np.ndarray]:
+def flow_weights(shifts: list[Shifts]) -> list[np.ndarray]:
     """What each place counts: flow is the surer, and the likelier right at all, the more structure
     there is. What most weight lies on counts 1."""
     clear = clear_of(shifts)
@@ -163,7 +163,7 @@ def clear_of(shifts: list[Shifts]) -> float:
     return float(np.quantile(np.concatenate([s.structure for s in shifts]), CLEAR))
 
 
-def neighbours(cameras: list[Camera]) -> list[tuple[int, int]]:
+def neighbouring_views(cameras: list[Camera]) -> list[tuple[int, int]]:
     """Pairs of views from sides that are near one another, each once: what one shows against the
     other is what the other shows against it. The object is about the origin."""
     sides = np.array([c.centre / np.linalg.norm(c.centre) for c in cameras])
@@ -192,7 +192,7 @@ def shown_by(mesh: Mesh, scene, camera: Camera, mask: np.ndarray) -> Shown:
 def places_of(mesh: Mesh, scene, camera: Camera, x: np.ndarray, y: np.ndarray):
     """hit (N,), which of N positions in a picture show the mesh; and of these, (M, 3) each, the
     vertices of the face, their shares, the point and the normal."""
-    depth, face, uv = trace(scene, camera, x, y)
+    depth, face, uv = trace_rays(scene, camera, x, y)
     hit = np.isfinite(depth)
     corners, (u, v) = mesh.faces[face[hit]], uv[hit].T
     weights = np.stack([1 - u - v, u, v], -1)
@@ -219,7 +219,7 @@ def flows_of(
 ) -> list:
     """Of a view that shows `shown` against another one; of each of their channels, here and there
     (h, w, C), that has structure: rows and columns (N,) of at most SAMPLES pixels, flow (N, 2) and
-    structure (N,) there. both, x, y: see `met_by`."""
+    structure (N,) there. both, x, y: see `covisible_pixels`."""
     out = []
     if both.sum() < OVERLAP:
         return out
@@ -260,7 +260,7 @@ def shifts_of(
     return Shifts(i, j, *places, -flow[hit], structure[hit])
 
 
-def met_by(
+def covisible_pixels(
     scene, shown: Shown, camera: Camera, mask: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((h, w) bool, which pixels of what a view shows a camera sees too, inside its mask; where it
@@ -269,7 +269,7 @@ def met_by(
 
 
 def faced_by(shown: Shown, camera: Camera, mask: np.ndarray) -> Faced:
-    """What of `met_by` needs no scene: pixels that a camera sees where nothing is in between."""
+    """What of `covisible_pixels` needs no scene: pixels that a camera sees where nothing is in between."""
     at = camera.project(shown.point)
     x, y, _ = at.T
     inside = map_coordinates(mask, [y - 0.5, x - 0.5], order=1, mode="constant") > 0.9
@@ -278,7 +278,7 @@ def faced_by(shown: Shown, camera: Camera, mask: np.ndarray) -> Faced:
 
 
 def met_of(scene, shown: Shown, faced: Faced) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`met_by` of what a camera may see."""
+    """`covisible_pixels` of what a camera may see."""
     common = np.zeros(len(shown.point), bool)
     if len(faced.pixels):
         common[faced.pixels] = clear(scene, *faced.rays)
@@ -299,16 +299,18 @@ def tint_of(pictures, masks) -> np.ndarray:
     return np.mean([p[m > 0.5].mean(0) for p, m in zip(pictures, masks, strict=True)], 0)
 
 
-def channels_of(picture: np.ndarray, tint: np.ndarray) -> np.ndarray:
+def display_channels(picture: np.ndarray, tint: np.ndarray) -> np.ndarray:
     """(h, w, 3) of a picture (h, w, 3): its brightness as displays show it, and the shares of red
     and blue against a tint (3,), which shading and what is mirrored in the object's own colour
     leave alone."""
     solid = np.maximum(picture, 0) / np.maximum(tint, 1e-4)
     red_and_blue = solid[..., [0, 2]] / (solid.sum(-1, keepdims=True) + DIM)
-    return np.concatenate([brightness(picture)[..., None], red_and_blue], -1).astype(np.float32)
+    return np.concatenate([display_luminance(picture)[..., None], red_and_blue], -1).astype(
+        np.float32
+    )
 
 
-def brightness(picture: np.ndarray) -> np.ndarray:
+def display_luminance(picture: np.ndarray) -> np.ndarray:
     """(h, w) of a picture (h, w, 3), as displays show it."""
     return srgb_from_linear(np.clip(picture, 0, 1)).mean(-1).astype(np.float32)
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from relit.lighting.flash import incident, light_position
 from relit.materials.field import nearest_texel
-from relit.materials.rough_plastic import MIN_ALPHA, Coat, Plastic, base_radiance, evaluate
+from relit.materials.rough_plastic import MIN_ALPHA, Coat, Plastic, base_radiance, evaluate_plastic
 from relit.rendering.blocks import everywhere
 from relit.rendering.march import Marched, march, sphere_interval
 
@@ -91,7 +91,7 @@ class FlashAppearance:
         l, inverse = incident(position, x)
         alpha = alpha_at(learnt, x)
         diffuse, specular = mi.Color3f(*[dr.maximum(f, 0) for f in F[:3]]), dr.maximum(F[3], 0)
-        value = evaluate(Plastic(diffuse, specular, alpha), self.coat, n, -rays.d, l) * (
+        value = evaluate_plastic(Plastic(diffuse, specular, alpha), self.coat, n, -rays.d, l) * (
             inverse * self.intensity
         )
         if self.model.grid.n >= self.shadows_from:

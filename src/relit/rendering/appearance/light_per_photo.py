@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from relit.rendering.appearance.world_light import harmonics
+from relit.rendering.appearance.world_light import device_harmonics
 from relit.rendering.march import Marched
 
 EACH = 54  # numbers a photo
@@ -40,7 +40,7 @@ def shade_photos(m: Marched, rays, cameras, learnt):
     first = rays.view * (EACH // 3)
 
     def light(direction, offset):
-        y, log = harmonics(direction), mi.Color3f(0)
+        y, log = device_harmonics(direction), mi.Color3f(0)
         for k in range(9):
             log += y[k] * dr.gather(mi.Color3f, learnt, first + (offset + k))
         return dr.exp(dr.clip(log, -8, 5))

@@ -40,7 +40,7 @@ def start_world_light(level: float, views: int) -> tuple:
     return mi.Float(learnt), mi.Float(rates)
 
 
-def harmonics(n) -> list:
+def device_harmonics(n) -> list:
     """The nine real spherical harmonics up to order 2, not normalised, of Vector3f: a list of
     Floats."""
     x, y, z = n.x, n.y, n.z
@@ -56,7 +56,7 @@ def in_photo(cameras, view, v):
 def shading(n, learnt):
     """S(n) (Color3f) of directions n in the photo's frame."""
     log = mi.Color3f(0)
-    for k, y in enumerate(harmonics(n)):
+    for k, y in enumerate(device_harmonics(n)):
         log += y * everywhere(mi.Color3f, learnt, MAP // 3 + k, dr.width(n))
     return dr.exp(log)
 

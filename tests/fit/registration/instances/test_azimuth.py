@@ -7,16 +7,16 @@ import pytest
 
 from relit.fit.registration.instances import azimuth as turn_guess
 from relit.fit.registration.instances.azimuth import (
-    agreement,
     descended_alike,
     leaning,
     likelihood,
     on_outline,
     others_of,
+    pattern_evidence,
     turned_alike,
     turned_by,
 )
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.revolution_axis import Axis
 from relit.geometry.se3 import exp_so3, rotation_angle
 from support.painted_lump import SIZE, astray, camera_at, lump, shown
@@ -36,8 +36,8 @@ def print_twice(points: np.ndarray) -> np.ndarray:
     return np.where(mark[..., None], 0.05, paint)
 
 
-def view_of(camera, picture, mask) -> View:
-    return View(0, camera.with_pose(np.eye(4)), picture, mask, np.ones_like(mask), 1.0)
+def view_of(camera, picture, mask) -> InstanceView:
+    return InstanceView(0, camera.with_pose(np.eye(4)), picture, mask, np.ones_like(mask), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_the_right_pose_of_a_view_shows_what_the_others_show():
     tried = np.tile(np.eye(4), (7, 1, 1))
     tried[:, :3, :3] = [exp_so3(np.radians(a) * up) for a in (-40, -20, -6, 0, 6, 20, 40)]
     for told in (
-        agreement(others, views[0], tried @ poses[0]),
+        pattern_evidence(others, views[0], tried @ poses[0]),
         np.array([likelihood(others, views[0], p) for p in tried @ poses[0]]),
     ):
         assert told.argmax() == 3 and told[3] > 3 * max(told[0], told[1], told[5], told[6], 0)

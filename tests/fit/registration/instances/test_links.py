@@ -8,9 +8,9 @@ import pytest
 
 from relit.conventions import similarity
 from relit.fit.registration.instances import links as instance_links
-from relit.fit.registration.instances.links import borne_out
+from relit.fit.registration.instances.links import verified_links
 from relit.fit.registration.instances.options import DETAILED, Growth
-from relit.fit.registration.instances.views import crops_of
+from relit.fit.registration.instances.views import instance_crops
 from relit.fit.registration.register import crop_rings
 from relit.geometry.se3 import exp_so3
 from support.painted_ellipsoid import painted
@@ -25,8 +25,8 @@ def linked():
 
 
 def asked(views, poses, members):
-    crops = crops_of(views)
-    return borne_out(
+    crops = instance_crops(views)
+    return verified_links(
         views, crops, crop_rings(crops, DETAILED), DETAILED, (members, poses), (), Growth(), 0
     )
 

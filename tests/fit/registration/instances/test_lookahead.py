@@ -8,7 +8,7 @@ import pytest
 from relit.conventions import similarity
 from relit.fit.registration.instances import growth as instance_growth
 from relit.fit.registration.instances import lookahead as instance_lookahead
-from relit.fit.registration.instances.growth import ahead, standing
+from relit.fit.registration.instances.growth import ahead, lead_over_second
 from relit.fit.registration.instances.lookahead import branch_values, mean_of_known
 from relit.fit.registration.instances.options import Growth
 from relit.geometry.hull import NoShape
@@ -73,9 +73,9 @@ def test_who_joins_is_decided_by_what_becomes_of_the_others_and_by_its_lead(monk
     monkeypatch.setattr(instance_growth, "branch_values", values)
     poses, rest = np.tile(np.eye(4), (3, 1, 1)), [1, 2]
     rings = (None, None, None, None)
-    assert standing(places[:, 0], heights[:, 0], 0) == pytest.approx(0.12) and standing(
-        places[:, 0], heights[:, 0], 1
-    ) == pytest.approx(-0.12)
+    assert lead_over_second(places[:, 0], heights[:, 0], 0) == pytest.approx(
+        0.12
+    ) and lead_over_second(places[:, 0], heights[:, 0], 1) == pytest.approx(-0.12)
     told[2] = 0.3
     assert ahead(*rings, [0], poses, rest, places, heights, Growth(), 0, None) == (
         1,

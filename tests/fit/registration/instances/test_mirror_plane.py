@@ -12,7 +12,7 @@ from relit.fit.registration.instances import bodies as instance_bodies
 from relit.fit.registration.instances import mirror_plane
 from relit.fit.registration.instances.bodies import body_of
 from relit.fit.registration.instances.mirror_plane import (
-    Hull,
+    HullPoints,
     Plane,
     find_plane,
     flip,
@@ -59,10 +59,10 @@ def test_silhouettes_tell_where_the_plane_lies():
     for offset in (0.0, 0.08):
         moved = poses.copy()
         moved[:, 0, 3] += offset
-        share, found = Hull(views, moved).offset(np.array([1.0, 0.0, 0.0]))
+        share, found = HullPoints(views, moved).offset(np.array([1.0, 0.0, 0.0]))
         assert share > 0.98 and found == pytest.approx(offset, abs=0.03)
     wrong = [
-        Hull(views, poses).offset(np.array(n))[0]
+        HullPoints(views, poses).offset(np.array(n))[0]
         for n in ([0.0, 0.6, 0.8], [0.0, 0.0, 1.0], [0.6, 0.0, 0.8])
     ]
     assert max(wrong) < share - 0.01
@@ -137,7 +137,7 @@ def test_a_plane_must_lead_by_more_where_two_tell_it_and_the_last_one_is_believe
     assert found(3, 1.0, 1.04, 0.9, 0.9) is not None and found(3, 1.0, 1.03, 0.9, 0.9) is None
     assert found(2, 1.0, 1.09, 0.9, 0.9) is None and found(2, 1.0, 1.11, 0.9, 0.9) is not None
     monkeypatch.undo()
-    first, hull = Plane(np.array([1.0, 0.0, 0.0]), 0.0), Hull(views, poses)
+    first, hull = Plane(np.array([1.0, 0.0, 0.0]), 0.0), HullPoints(views, poses)
     near, far = (
         Plane(np.array([np.cos(0.2), 0.0, np.sin(0.2)]), 0.0),
         Plane(np.array([0.0, 1.0, 0.0]), 0.0),

@@ -15,7 +15,11 @@ from relit.fit.duplicates import pose_passes
 from relit.fit.duplicates.options import options_for
 from relit.fit.registration.instances import near_symmetry_search as instance_turns
 from relit.fit.registration.instances import search as instance_search
-from relit.fit.registration.instances.near_symmetry import AlikeTurn, alike_turns, apart
+from relit.fit.registration.instances.near_symmetry import (
+    AlikeTurn,
+    alike_turns,
+    distinct_rotations,
+)
 from relit.fit.registration.instances.near_symmetry_search import (
     Turned,
     axis_moved,
@@ -27,7 +31,7 @@ from relit.fit.registration.instances.near_symmetry_search import (
 from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.regrowth import Placed
 from relit.fit.registration.instances.silhouette_turns import Silhouettes
-from relit.fit.registration.instances.views import crops_of
+from relit.fit.registration.instances.views import instance_crops
 from relit.fit.registration.register import crop_rings
 from relit.geometry.se3 import exp_so3, rotation_angle
 from relit.scene import Mesh
@@ -88,8 +92,8 @@ def test_of_turns_that_are_nearly_the_same_or_undo_one_another_the_best_is_kept(
         (k / 10, exp_so3(np.radians(a) * np.array([0, 1.0, 0])))
         for k, a in enumerate((75, -115, 180, 110, 120, 60))
     ]
-    assert [value for value, _ in apart(tried, 5)] == [0.5, 0.4, 0.2]
-    assert [value for value, _ in apart(tried, 2)] == [0.5, 0.4]
+    assert [value for value, _ in distinct_rotations(tried, 5)] == [0.5, 0.4, 0.2]
+    assert [value for value, _ in distinct_rotations(tried, 2)] == [0.5, 0.4]
 
 
 def test_silhouettes_of_one_body_leave_the_smallest_gap(pots):
@@ -119,7 +123,7 @@ def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monk
     monkeypatch.setattr(instance_turns, "ASKED", 1)
     monkeypatch.setattr(instance_turns, "SETTLED", 1)
     views, poses = pots
-    crops, said = crops_of(views), []
+    crops, said = instance_crops(views), []
     rings = crop_rings(crops, DETAILED)
     off = turned(poses, WRONG)
     assert (errors(off, poses) > 170).sum() == 4
@@ -141,7 +145,7 @@ def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monk
 def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
     monkeypatch.setattr(instance_turns, "ASKED", 1)
     views, poses = pots
-    crops, off = crops_of(views), turned(poses, WRONG)
+    crops, off = instance_crops(views), turned(poses, WRONG)
     found = coherent_turns(
         views, crops, crop_rings(crops, DETAILED), off, Search(), seed=0, exact=True
     )
@@ -156,11 +160,13 @@ def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
         Mesh(s.vertices, s.faces)
         for s in (trimesh.creation.box((1.2, 0.7, 0.4)), trimesh.creation.cylinder(0.3, 1.2))
     )
-    assert pose_passes.told_apart(mesh, views, off, run, options, 0) is found.poses
-    assert pose_passes.told_apart(rod, views, off, run, options, 0) is None
-    assert pose_passes.told_apart(mesh, views[:3], off[:3], run, options, 0) is None
+    assert pose_passes.resolve_near_symmetry(mesh, views, off, run, options, 0) is found.poses
+    assert pose_passes.resolve_near_symmetry(rod, views, off, run, options, 0) is None
+    assert pose_passes.resolve_near_symmetry(mesh, views[:3], off[:3], run, options, 0) is None
     assert (
-        pose_passes.told_apart(mesh, views, off, run, replace(options, without=("search",)), 0)
+        pose_passes.resolve_near_symmetry(
+            mesh, views, off, run, replace(options, without=("search",)), 0
+        )
         is None
     )
 
@@ -185,8 +191,8 @@ def enlarged(view, times):
 def test_an_object_that_looks_like_itself_all_the_way_is_left_alone(monkeypatch):
     """Neither spout nor handle: either way is right. No models are fitted to find that out."""
     views, poses = pot([BODY])
-    crops = crops_of(views)
-    monkeypatch.setattr(instance_turns, "judged", lambda *_: pytest.fail("asked"))
+    crops = instance_crops(views)
+    monkeypatch.setattr(instance_turns, "score_settled_poses", lambda *_: pytest.fail("asked"))
     assert (
         coherent_turns(
             views, crops, crop_rings(crops, DETAILED), turned(poses, WRONG), Search(), seed=0
@@ -205,11 +211,14 @@ def test_who_stands_up_to_such_turns_is_no_longer_unsure(pots, monkeypatch):
         "stands",
         lambda views, crops, rings, turned, k, *_: turned is found and k != 4,
     )
-    best = instance_search.up_to_turns(views, crops_of(views), placed, Search(), seed=0)
+    best = instance_search.up_to_turns(views, instance_crops(views), placed, Search(), seed=0)
     assert (
         np.array_equal(best.poses, found.poses)
         and best.unsure == (4,)
         and best.agreement == found.own.mean()
     )
     monkeypatch.setattr(instance_search, "coherent_turns", lambda *_, **__: None)
-    assert instance_search.up_to_turns(views, crops_of(views), placed, Search(), seed=0) is placed
+    assert (
+        instance_search.up_to_turns(views, instance_crops(views), placed, Search(), seed=0)
+        is placed
+    )

@@ -16,7 +16,7 @@ from relit.fit.registration.instances.azimuth import turned_by
 from relit.fit.registration.instances.azimuth_maps import turned_about
 from relit.fit.registration.instances.outliers import view_errors
 from relit.fit.registration.instances.recovery import sought_again
-from relit.fit.registration.instances.views import View, overlaps, pixel_bank
+from relit.fit.registration.instances.views import InstanceView, overlaps, pixel_bank
 from relit.fit.registration.register import volume_render
 from relit.geometry.revolution_axis import Axis
 from relit.geometry.se3 import rotation_angle
@@ -39,7 +39,7 @@ def lump():
     for number, (_, _, camera) in enumerate(photos_of(model, 2, np.random.default_rng(4))):
         rgb, mask = (a[0] for a in volume_render(model)([camera]))
         views.append(
-            View(
+            InstanceView(
                 number,
                 camera.with_pose(np.eye(4)),
                 rgb * (1.0 - 0.4 * number),
@@ -86,7 +86,7 @@ def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
     turned[1, :3] = np.diag([-1.0, 1.0, -1.0]) @ turned[1, :3]
     monkeypatch.setattr(module, "candidates", lambda *_: turned)
     for errors, out in (([1.0, 1.5], True), ([1.0, 3.0], False), ([9.0, 30.0], True)):
-        monkeypatch.setattr(module, "descended", lambda *_, e=errors: (turned, np.array(e)))
+        monkeypatch.setattr(module, "refine_candidates", lambda *_, e=errors: (turned, np.array(e)))
         assert (sought_again(hidden, guide, poses[0], model, 1.0, None, none)[0] is None) == out
 
 
@@ -103,7 +103,7 @@ def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turne
     tried = np.stack([turned_by(poses[0], axis, 1.01), shifted[1]])
     monkeypatch.setattr(module, "candidates", lambda *_: tried)
     monkeypatch.setattr(
-        module, "descended", lambda *_: (tried, np.array([50.0, 20.0]))
+        module, "refine_candidates", lambda *_: (tried, np.array([50.0, 20.0]))
     )  # nothing agrees, least where the outline does not
     monkeypatch.setattr(
         module, "overlaps", lambda render, _, some: np.where(np.arange(len(some)) % 2 > 0, 0.5, 1)
@@ -138,7 +138,7 @@ def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
             asked.append(rest[-1])
             return poses[[1, 0]], np.array(errors_of_turn[len(asked) - 1])
 
-        monkeypatch.setattr(module, "descended", descended)
+        monkeypatch.setattr(module, "refine_candidates", descended)
         return sought_again(hidden, guide, poses[0], None, 1.0, None, none, 5)[0]
 
     monkeypatch.setattr(module, "candidates", lambda *_: poses[[1, 0]])
@@ -176,7 +176,7 @@ def test_the_best_places_are_looked_into_where_none_is_certain(
         "candidates",
         lambda *_: np.stack([poses[1], poses[0], turned_about(poses[0], 0.1), turned]),
     )
-    monkeypatch.setattr(module, "descended", descended)
+    monkeypatch.setattr(module, "refine_candidates", descended)
     pose, sure = sought_again(hidden, guide, poses[0], None, 1.0, None, none, 5, guess=True)
     assert asked == (
         [(module.STEPS, 4), (module.LONGER, 2)] * rounds if then else [(module.STEPS, 4)]

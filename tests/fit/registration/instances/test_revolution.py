@@ -12,7 +12,7 @@ from relit.conventions import similarity
 from relit.fit.registration.instances import revolution_search as instance_revolution
 from relit.fit.registration.instances import search as instance_search
 from relit.fit.registration.instances.azimuth_maps import (
-    Told,
+    AzimuthEstimate,
     cells_read,
     empty_board,
     turned_about,
@@ -29,22 +29,27 @@ from relit.fit.registration.instances.revolution import KNOTS, OUTLINE, axis_of,
 from relit.fit.registration.instances.revolution_fit import (
     Revolved,
     adjusted_pose,
+    crop_outline,
     fit_revolution,
-    fitted,
     leaning_the_other_way,
-    outline_of,
+    refine_revolution,
     seats_of,
 )
-from relit.fit.registration.instances.revolution_search import EXACT, LONGER, flat, place_revolved
+from relit.fit.registration.instances.revolution_search import (
+    EXACT,
+    LONGER,
+    lies_on_plane,
+    place_revolved,
+)
 from relit.fit.registration.instances.unrolled import (
     LATITUDES,
     ONE_VALUE,
     TURNS,
-    cells_of,
     one_value,
+    pattern_cells,
     turned_by_decoration,
 )
-from relit.fit.registration.instances.views import View, crops_of
+from relit.fit.registration.instances.views import InstanceView, instance_crops
 from relit.fit.registration.register import crop_rings
 from relit.geometry.se3 import rotation_angle
 from relit.scene import Camera
@@ -85,17 +90,17 @@ def ellipsoid(*radii: float) -> tuple[np.ndarray, np.ndarray]:
     return p * np.array(radii), 0.2 + 0.5 * (np.sin(9 * p) > 0)
 
 
-def seen(points: np.ndarray, colours: np.ndarray, pose: np.ndarray, label: int) -> View:
+def seen(points: np.ndarray, colours: np.ndarray, pose: np.ndarray, label: int) -> InstanceView:
     """The points before the camera, each over those behind it."""
     at = (points - pose[:3, 3]) @ pose[:3, :3]
     u, v = (np.floor(FOCAL * at[:, i] / at[:, 2] + SIDE / 2).astype(int) for i in (0, 1))
     nearest = np.lexsort((-at[:, 2], v * SIDE + u))  # of each pixel the last is the nearest
     rgb, mask = np.zeros((SIDE, SIDE, 3), np.float32), np.zeros((SIDE, SIDE), np.float32)
     rgb[v[nearest], u[nearest]], mask[v[nearest], u[nearest]] = colours[nearest], 1
-    return View(label, CAMERA, rgb, mask, np.ones((SIDE, SIDE), np.float32), 1.0)
+    return InstanceView(label, CAMERA, rgb, mask, np.ones((SIDE, SIDE), np.float32), 1.0)
 
 
-def pile(points, colours, count: int, seed: int) -> tuple[list[View], np.ndarray]:
+def pile(points, colours, count: int, seed: int) -> tuple[list[InstanceView], np.ndarray]:
     turns = Rotation.random(count, random_state=seed).as_matrix()
     poses = np.array([similarity(r, -AWAY * r @ np.array([0.02, -0.03, 1.0])) for r in turns])
     return [seen(points, colours, pose, k + 1) for k, pose in enumerate(poses)], poses
@@ -104,13 +109,13 @@ def pile(points, colours, count: int, seed: int) -> tuple[list[View], np.ndarray
 @pytest.fixture(scope="module")
 def bottles():
     views, poses = pile(*bottle(), 7, 3)
-    crops = crops_of(views)
+    crops = instance_crops(views)
     body = fit_revolution(views, crops)
     return views, crops, poses, body, seats_of(crops, body)
 
 
 @pytest.fixture(scope="module")
-def told(bottles) -> Told:
+def told(bottles) -> AzimuthEstimate:
     """Their turns about the axis, by decoration."""
     views, _, _, body, seats = bottles
     return turned_by_decoration(views, body.profile, seats)["colour and brightness"]
@@ -154,7 +159,7 @@ def test_decoration_tells_the_turns_about_them(bottles, told):
 def test_a_pose_that_is_off_comes_back_to_its_outline(bottles):
     _, crops, _, body, _ = bottles
     for crop, pose in zip(crops[:4], body.poses, strict=False):
-        outline, tilted = outline_of(crop), pose.copy()
+        outline, tilted = crop_outline(crop), pose.copy()
         tilt = Rotation.from_rotvec(np.radians([0.0, 0.0, 6.0])).as_matrix()
         tilted[:3] = np.concatenate([tilt @ pose[:3, :3], (tilt @ pose[:3, 3:])], 1)
         before = float(
@@ -188,7 +193,7 @@ def test_what_has_no_axis_is_not_sure_of_it(radii):
     """Ellipses are the outlines of a body of revolution too: what is not sure of its turns is left
     to the search."""
     views, _ = pile(*ellipsoid(*radii), 4, 1)
-    found = place_revolved(views, crops_of(views), OPTIONS)
+    found = place_revolved(views, instance_crops(views), OPTIONS)
     assert found is None or (not found.certain and len(found.placed.unsure) > len(views) / 2)
 
 
@@ -199,12 +204,12 @@ def test_two_maps_of_one_decoration_are_laid_on_each_other():
     shown = np.ones((LATITUDES, TURNS), bool)
     shown[:, 70:] = False
     board = empty_board(ONE_VALUE, (LATITUDES, TURNS))
-    board.lay(cells_of(shown, values), 0)
+    board.lay(pattern_cells(shown, values), 0)
     before = board.total.copy()
-    gains = board.gains(cells_of(np.roll(shown, -17, 1), np.roll(values, -17, 2)))
+    gains = board.gains(pattern_cells(np.roll(shown, -17, 1), np.roll(values, -17, 2)))
     assert gains.argmax() == 17 and gains.max() > 3 * np.sort(gains)[-12]
-    board.lay(cells_of(shown, values), 31)
-    board.lay(cells_of(shown, values), 31, -1)
+    board.lay(pattern_cells(shown, values), 31)
+    board.lay(pattern_cells(shown, values), 31, -1)
     assert np.allclose(board.total, before)
 
 
@@ -263,7 +268,7 @@ def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, 
 
     monkeypatch.setattr(instance_revolution, "decoration_agreement", agreement)
     assert (
-        instance_revolution.likeliest(None, None, {name: name for name in short}, OPTIONS, 0)
+        instance_revolution.most_likely_set(None, None, {name: name for name in short}, OPTIONS, 0)
         == told
     )
     assert len(fits) == asked and max(fits) == (LONGER if long else 1) * 2 * OPTIONS.steps
@@ -271,8 +276,10 @@ def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, 
 
 def test_without_an_answer_that_agrees_none_is_likeliest(monkeypatch):
     monkeypatch.setattr(instance_revolution, "decoration_agreement", lambda *a: -np.inf)
-    assert instance_revolution.likeliest(None, None, {"a": None, "b": None}, OPTIONS, 0) is None
-    assert instance_revolution.likeliest(None, None, {}, OPTIONS, 0) is None
+    assert (
+        instance_revolution.most_likely_set(None, None, {"a": None, "b": None}, OPTIONS, 0) is None
+    )
+    assert instance_revolution.most_likely_set(None, None, {}, OPTIONS, 0) is None
 
 
 def placed(bottles, told, monkeypatch, sure):
@@ -288,11 +295,11 @@ def placed(bottles, told, monkeypatch, sure):
     )
     monkeypatch.setattr(
         "relit.fit.registration.instances.revolution_search.turned_by_decoration",
-        lambda *a: {"colour": Told(told.poses, sure)},
+        lambda *a: {"colour": AzimuthEstimate(told.poses, sure)},
     )
     monkeypatch.setattr(
         instance_search,
-        "settled",
+        "refine_and_verify",
         lambda views, crops, rings, poses, scores, o, **_: (poses, scores, set()),
     )
     found = instance_search.place(views, OPTIONS, say=said.append)
@@ -336,7 +343,7 @@ def test_bodies_of_revolution_that_are_not_sure_keep_their_axes_where_the_search
     asked = []
     monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: asked.append(1) or {})
     monkeypatch.setattr(
-        "relit.fit.registration.instances.revolution_search.flat", lambda poses: False
+        "relit.fit.registration.instances.revolution_search.lies_on_plane", lambda poses: False
     )
     _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
     assert asked and any("7 of 7 are not sure" in text for text in said)
@@ -349,7 +356,7 @@ def test_bodies_of_revolution_on_one_plane_are_not_searched_whether_they_are_sur
         instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
     )
     monkeypatch.setattr(
-        "relit.fit.registration.instances.revolution_search.flat", lambda poses: True
+        "relit.fit.registration.instances.revolution_search.lies_on_plane", lambda poses: True
     )
     _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
     assert any("7 of 7 are not sure" in text for text in said)
@@ -372,8 +379,10 @@ def standing_on_a_plane(count: int, off: float) -> np.ndarray:
 
 
 def test_a_plane_that_the_middles_lie_on_is_seen_whatever_their_turns():
-    assert flat(standing_on_a_plane(10, 0.2)) and not flat(standing_on_a_plane(10, 1.0))
-    assert not flat(
+    assert lies_on_plane(standing_on_a_plane(10, 0.2)) and not lies_on_plane(
+        standing_on_a_plane(10, 1.0)
+    )
+    assert not lies_on_plane(
         standing_on_a_plane(5, 0.0)
     )  # any three points have a plane, and of five little is left to tell
 
@@ -438,11 +447,11 @@ def test_without_a_handle_outlines_tell_no_turns(bottles):
 def test_axes_that_all_lean_the_wrong_way_come_back(bottles):
     """From afar all outlines together are the same so; perspective tells."""
     _, crops, _, body, _ = bottles
-    outlines, rings = [outline_of(c) for c in crops], crop_rings(crops, OUTLINE)
+    outlines, rings = [crop_outline(c) for c in crops], crop_rings(crops, OUTLINE)
     wrong = Revolved(
         body.profile, np.array([leaning_back(p) for p in body.poses]), np.full(len(crops), 0.01)
     )
     assert np.median([off_axis(a, b, 1) for a, b in zip(wrong.poses, body.poses, strict=True)]) > 20
-    back = fitted(outlines, rings, leaning_the_other_way(outlines, wrong))
+    back = refine_revolution(outlines, rings, leaning_the_other_way(outlines, wrong))
     assert back.misfit < 1.5 * body.misfit
     assert np.median([off_axis(a, b, 1) for a, b in zip(back.poses, body.poses, strict=True)]) < 5

@@ -11,7 +11,13 @@ import pytest
 
 from relit.conventions import similarity
 from relit.fit.duplicates.scene import find_ground
-from relit.fit.registration.instances.growth import ANOTHER, Grown, grow, lead, linked_poses
+from relit.fit.registration.instances.growth import (
+    ANOTHER,
+    Grown,
+    grow_instances,
+    lead,
+    linked_poses,
+)
 from relit.fit.registration.instances.guesses import Guesses, first_pairs
 from relit.fit.registration.instances.links import linked_sets
 from relit.fit.registration.instances.lookup import look_for
@@ -21,17 +27,17 @@ from relit.fit.registration.instances.regrowth import (
     believed,
     confirmed,
     improved,
-    judged,
+    score_growth,
     staying,
 )
 from relit.fit.registration.instances.rounds import (
     LOW,
     ambiguous,
-    crops_of,
+    instance_crops,
     nearer,
     reconsider,
+    refine_and_verify,
     regrown,
-    settled,
     trusted,
 )
 from relit.fit.registration.instances.search import (
@@ -48,7 +54,7 @@ from relit.fit.registration.instances.views import (
     fit_model,
     frame_scale,
     hold_distances,
-    inflated,
+    inflate_silhouette,
     move_poses,
     pixel_bank,
     taut_body,
@@ -138,7 +144,7 @@ def test_a_disc_inflates_to_a_body_as_wide_and_nearly_as_deep():
     cv2.circle(labels, (140, 70), 30, 1, -1)
     views = views_of(np.zeros((120, 200, 3), np.float32), labels, CAMERA, 10**6)
     pose = first_pose(views[0], frame_scale(views))
-    values = inflated(views[0], pose, 33)
+    values = inflate_silhouette(views[0], pose, 33)
     inside = node_positions(33)[values < 0]
     assert np.abs(inside.mean(0)).max() < 0.1
     reach = np.abs(inside).max(0)
@@ -254,10 +260,10 @@ def test_growing_again_ends_with_the_best_agreement(monkeypatch):
         poses[rest] = truth[rest] if right else start[rest]
         return Grown(poses, np.ones(6), tuple(stay), tuple(rest))
 
-    monkeypatch.setattr(instance_regrowth, "grow", grown)
-    crops, said = crops_of(views), []
+    monkeypatch.setattr(instance_regrowth, "grow_instances", grown)
+    crops, said = instance_crops(views), []
     rings, o = crop_rings(crops, DETAILED), Search(nodes=24, steps=12, regrowths=12, idle=12)
-    begun = judged(views, Grown(start, np.ones(6), (0, 1), (2, 3, 4, 5)), DETAILED, o, 0)
+    begun = score_growth(views, Grown(start, np.ones(6), (0, 1), (2, 3, 4, 5)), DETAILED, o, 0)
     best = improved(views, crops, rings, begun, o, seed=0, say=said.append)
     assert np.array_equal(best.poses, truth) and best.agreement > begun.agreement + 0.02
     assert any("grown again" in text for text in said) and best.unsure
@@ -287,8 +293,8 @@ def test_what_most_of_a_growth_was_sure_of_stays_before_another_start_is_made(
             )
         return Grown(truth.copy(), np.ones(6), tuple(range(6)), ())
 
-    monkeypatch.setattr(instance_search, "grow", grown)
-    monkeypatch.setattr(instance_regrowth, "grow", grown)
+    monkeypatch.setattr(instance_search, "grow_instances", grown)
+    monkeypatch.setattr(instance_regrowth, "grow_instances", grown)
     monkeypatch.setattr(
         instance_search, "confirmed", lambda views, crops, rings, placed, o, **_: placed
     )
@@ -296,7 +302,9 @@ def test_what_most_of_a_growth_was_sure_of_stays_before_another_start_is_made(
     monkeypatch.setattr(
         instance_search, "first_starts", lambda *_: [([0, 1], truth), ([2, 3], truth)]
     )
-    best = grown_from_pairs(views, crops_of(views), None, Search(nodes=24, steps=12, starts=2))
+    best = grown_from_pairs(
+        views, instance_crops(views), None, Search(nodes=24, steps=12, starts=2)
+    )
     assert grown_from == [[0, 1], [0, 1, 2, 3] if sought == "all but the last two" else [2, 3]]
     assert np.array_equal(best.poses, truth) and not best.unsure
 
@@ -322,14 +330,14 @@ def test_those_who_were_unsure_are_asked_again_once_all_others_stand(monkeypatch
     from relit.fit.registration.instances import regrowth as instance_regrowth
 
     views, truth = painted([0, 20, 40, 60, 80, 100])
-    crops, o, asked = crops_of(views), Search(nodes=24, steps=12), []
+    crops, o, asked = instance_crops(views), Search(nodes=24, steps=12), []
 
     def grown(views, crops, rings, parts, stay, poses, *_, **__):
         asked.append(stay)
         return Grown(truth.copy(), np.ones(6), tuple(stay), ())
 
-    monkeypatch.setattr(instance_regrowth, "grow", grown)
-    begun = judged(views, Grown(truth, np.ones(6), (0, 1), (2, 4)), DETAILED, o, 0)
+    monkeypatch.setattr(instance_regrowth, "grow_instances", grown)
+    begun = score_growth(views, Grown(truth, np.ones(6), (0, 1), (2, 4)), DETAILED, o, 0)
     rings = crop_rings(crops, DETAILED)
     after = confirmed(views, crops, rings, begun, o, seed=0)
     assert asked == [[0, 1, 3, 5]] and after.unsure == () and believed(after, o)
@@ -346,7 +354,7 @@ def test_what_doubt_moves_is_kept_only_where_all_agree_no_worse(monkeypatch):
     from relit.fit.registration.instances import rounds as instance_rounds
 
     views, truth = painted([0, 20, 40, 60])
-    crops, sent, asked = crops_of(views), truth + 1, []
+    crops, sent, asked = instance_crops(views), truth + 1, []
     rings = crop_rings(crops, DETAILED)
 
     def doubt(views, crops, rings, poses, scores, o, *, sure, **__):
@@ -361,7 +369,7 @@ def test_what_doubt_moves_is_kept_only_where_all_agree_no_worse(monkeypatch):
     for levels, moved in (([0.9, 0.8], False), ([0.9, 0.95], True)):
         told = iter(levels)
         monkeypatch.setattr(instance_rounds, "agreement_of", lambda *_, told=told: next(told, 0.95))
-        poses, _, torn = settled(
+        poses, _, torn = refine_and_verify(
             views, crops, rings, truth.copy(), np.ones(4), Search(rounds_doubted=2), seed=0
         )
         assert np.array_equal(poses, sent if moved else truth) and torn == (set() if moved else {2})
@@ -482,11 +490,11 @@ def test_views_across_bound_what_one_leaves_open_in_depth():
 def test_an_instance_joins_those_that_stand_and_poses_wait_for_the_shape():
     views, truth = painted([0, 20, 40])
     parts = (0.6, 2.0, 0.1)
-    crops = crops_of(views)
+    crops = instance_crops(views)
     o = Growth(nodes=24, steps=12, viewpoints=300, keep=1)
     start = truth.copy()
     start[2] = np.eye(4)
-    grown = grow(views, crops, crop_rings(crops, parts), parts, [0, 1], start, o)
+    grown = grow_instances(views, crops, crop_rings(crops, parts), parts, [0, 1], start, o)
     poses, scores = grown.poses, grown.scores
     assert set(grown.firm) >= {0, 1} and len(grown.firm) + len(grown.unsure) == 3
     assert (
@@ -535,7 +543,7 @@ def test_poses_are_found_from_silhouettes_and_colours_alone():
 def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
     views, truth = painted([0, 20, 40, 60])
     parts = (0.6, 2.0, 0.1)
-    crops = crops_of(views)
+    crops = instance_crops(views)
     rings = crop_rings(crops, parts)
     wrong = exp_so3(np.array([0.0, np.radians(70), 0.0]))
     poses = truth.copy()
@@ -569,7 +577,7 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
     from relit.fit.registration.instances import rounds as instance_rounds
 
     views, truth = painted([0, 20, 40, 60, 80, 100])
-    crops, o, said, members = crops_of(views), Search(nodes=24, steps=12), [], []
+    crops, o, said, members = instance_crops(views), Search(nodes=24, steps=12), [], []
 
     def grown(views, crops, rings, parts, rest, poses, *_, **__):
         assert parts == DETAILED
@@ -577,9 +585,9 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
         return Grown(truth.copy(), np.ones(6), tuple(rest), ())
 
     monkeypatch.setattr(instance_rounds, "LOW", LOW / 2)  # eight colours tell less than a print
-    monkeypatch.setattr(instance_rounds, "grow", grown)
+    monkeypatch.setattr(instance_rounds, "grow_instances", grown)
     monkeypatch.setattr(
-        instance_rounds, "descend", lambda v, c, r, poses, scores, *_, **__: (poses, scores)
+        instance_rounds, "refine_jointly", lambda v, c, r, poses, scores, *_, **__: (poses, scores)
     )
     poses = truth.copy()
     for k in (1, 2):
@@ -599,7 +607,7 @@ def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch
     from relit.fit.registration.instances import rounds as instance_rounds
 
     views, truth = painted([0, 20, 40, 60])
-    crops = crops_of(views)
+    crops = instance_crops(views)
     rings = crop_rings(crops, DETAILED)
     for own, asked in (([0.9, 0.9, 0.85, 0.9], False), ([0.9, 0.9, 0.3, 0.9], True)):
         judged = iter([np.array(own), np.array(own) - 0.1])
@@ -607,11 +615,13 @@ def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch
             instance_rounds, "model_of_all", lambda *_, judged=judged, **__: (None, next(judged))
         )
         monkeypatch.setattr(
-            instance_rounds, "descend", lambda v, c, r, poses, scores, *_, **__: (poses + 1, scores)
+            instance_rounds,
+            "refine_jointly",
+            lambda v, c, r, poses, scores, *_, **__: (poses + 1, scores),
         )
         monkeypatch.setattr(
             instance_rounds,
-            "grow",
+            "grow_instances",
             lambda v, c, r, p, rest, poses, *_, **__: Grown(poses + 1, np.ones(len(poses)), (), ()),
         )
         said: list[str] = []
@@ -628,7 +638,7 @@ def test_silhouettes_without_anything_in_common_are_left_as_they_are(monkeypatch
         raise NoShape("the occupancy is empty or full")
 
     views, truth = painted([0, 20, 40, 60])
-    crops = crops_of(views)
+    crops = instance_crops(views)
     monkeypatch.setattr(instance_rounds, "model_of_all", nothing)
     poses, _ = regrown(
         views, crops, crop_rings(crops, DETAILED), truth, np.ones(4), Search(), seed=0
@@ -648,18 +658,24 @@ def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead(
     directions = directions_around(500)
     close = (directions @ (truth[:, :3, 3] / 5).T).max(1) > np.cos(np.radians(30))
     gallery = make_gallery(albedo_render(model), views_from(directions[close], 5.0), parts)
-    crops = crops_of([cut])
+    crops = instance_crops([cut])
     rings = crop_rings(crops, parts)
     found = look_for([cut], crops, gallery, rings, parts, keep=2)
     assert rotation_angle(found.poses[0, 0][:3, :3].T @ truth[1][:3, :3]) < 15
     assert found.scores[0, 0] > search(crops, gallery, keep=1, rings=rings).scores[0, 0] + 0.02
     assert rotation_angle(found.poses[0, 0][:3, :3].T @ found.poses[0, 1][:3, :3]) >= 20
     whole = look_for(
-        views[:1], crops_of(views[:1]), gallery, crop_rings(crops_of(views[:1]), parts), parts
+        views[:1],
+        instance_crops(views[:1]),
+        gallery,
+        crop_rings(instance_crops(views[:1]), parts),
+        parts,
     )
     assert np.array_equal(
         whole.poses,
-        search(crops_of(views[:1]), gallery, rings=crop_rings(crops_of(views[:1]), parts)).poses,
+        search(
+            instance_crops(views[:1]), gallery, rings=crop_rings(instance_crops(views[:1]), parts)
+        ).poses,
     )
 
 

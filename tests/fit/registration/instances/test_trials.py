@@ -6,7 +6,7 @@ import pytest
 from relit.conventions import similarity
 from relit.fit.registration.instances import trials as instance_trials
 from relit.fit.registration.instances.options import Search
-from relit.fit.registration.instances.search import Found
+from relit.fit.registration.instances.search import SearchResult
 from relit.fit.registration.instances.trials import SAME, place_few, turned_apart
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import exp_so3
@@ -53,7 +53,7 @@ def search(monkeypatch):
             one = left.pop(0)
             if isinstance(one, Exception):
                 raise one
-            return Found(one, np.full(len(one), 0.9), sure)
+            return SearchResult(one, np.full(len(one), 0.9), sure)
 
         monkeypatch.setattr(instance_trials, "place", place)
         monkeypatch.setattr(

@@ -40,7 +40,7 @@ def test_right_poses_have_less_misfit_than_wrong_ones(photos, crops, monkeypatch
     monkeypatch.setattr(few, "STEPS", 80)
     right = true_poses(photos)
     wrong = right[np.random.default_rng(3).permutation(len(right))]
-    assert few.misfit(crops, right, 0) < 0.7 * few.misfit(crops, wrong, 0)
+    assert few.photometric_misfit(crops, right, 0) < 0.7 * few.photometric_misfit(crops, wrong, 0)
 
 
 @pytest.mark.parametrize(("score", "taken"), [(0.95, 1), (0.9, 0)])
@@ -50,7 +50,9 @@ def test_the_way_that_explains_the_photos_is_taken_unless_it_lost_some(
     from relit.fit.registration.photos import few
 
     ends = np.zeros((len(crops), 4, 4)), np.ones((len(crops), 4, 4))
-    monkeypatch.setattr(few, "misfit", lambda _, poses, __: 0.2 if poses is ends[0] else 0.1)
+    monkeypatch.setattr(
+        few, "photometric_misfit", lambda _, poses, __: 0.2 if poses is ends[0] else 0.1
+    )
     ways = {
         "one": lambda: (ends[0], np.full(len(crops), 0.99)),
         "two": lambda: (ends[1], np.full(len(crops), score)),
@@ -82,7 +84,7 @@ def test_ways_that_fail_are_passed_over(crops, monkeypatch):
         raise NoShape("nothing in common")
 
     a = np.zeros((len(crops), 4, 4))
-    monkeypatch.setattr(few, "misfit", lambda *_: 0.2)
+    monkeypatch.setattr(few, "photometric_misfit", lambda *_: 0.2)
     assert (
         few.best_way(crops, {"no": fails, "yes": lambda: (a, np.ones(len(crops)))}, 0, quiet)[0]
         is a

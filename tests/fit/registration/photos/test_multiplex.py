@@ -115,13 +115,13 @@ def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_search
     monkeypatch.setattr(collection_held_out, "replace", lambda model, **_: model)
     monkeypatch.setattr(collection_held_out, "is_cut", lambda _: False)
     monkeypatch.setattr(collection_held_out, "search", search)
-    monkeypatch.setattr(collection, "crops_of", lambda _: [None])
+    monkeypatch.setattr(collection, "collection_crops", lambda _: [None])
     monkeypatch.setattr(collection, "poses_from_links", links)
     monkeypatch.setattr(collection, "find_poses", poses)
     many, one = CollectionOptions(keep=4), CollectionOptions(keep=4, without=("multiplex",))
     for options, expected, elsewhere in ((many, 4, collection_held_out.CHOICES), (one, 1, 1)):
         kept.clear()
-        collection_held_out.register(shots, None, 45.0, options, 0)
+        collection_held_out.register_held_out(shots, None, 45.0, options, 0)
         collection.find_all(shots, [], 45.0, quiet, options, 0)
         assert kept == [expected] * 4
         with pytest.raises(SearchedAgain):

@@ -31,19 +31,19 @@ def told(rotations, near, seed=0):
 
 
 def test_mutual_pairs_hold_a_set_together():
-    from relit.fit.registration.photos.pairs import agreeing, mutual
+    from relit.fit.registration.photos.pairs import largest_consistent_set, mutual_pairs
 
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(24, 3)) + np.array([0, 0.6, 1.2])
     rotations = np.array([look_at(3 * d / np.linalg.norm(d))[:3, :3] for d in directions])
-    pairs = mutual(*told(rotations, 60))
+    pairs = mutual_pairs(*told(rotations, 60))
     assert (np.diff([p.score for p in pairs]) <= 0).all()
     right = [
         rotation_angle(p.rotation.T @ rotations[p.first].T @ rotations[p.second]) < 25
         for p in pairs
     ]
     assert np.mean(right[:15]) > 0.9 and not all(right)  # chance makes pairs too
-    placed = agreeing(pairs, 24)
+    placed = largest_consistent_set(pairs, 24)
     assert len(placed) >= 8
     first = min(placed)
     off = [
@@ -51,7 +51,7 @@ def test_mutual_pairs_hold_a_set_together():
         for k in placed
     ]
     assert np.mean(np.array(off) < 25) > 0.85
-    assert agreeing([], 24) == {}
+    assert largest_consistent_set([], 24) == {}
 
 
 def test_a_photo_is_placed_with_its_silhouette_in_the_middle():
@@ -221,15 +221,17 @@ def test_growth_begins_from_pairs_where_they_hold_enough(monkeypatch, photos, he
     asked, grown = [], []
     monkeypatch.setattr(growth, "crop_rings", lambda *_: None)
     monkeypatch.setattr(growth, "pairs_of", lambda *_: asked.append(1))
-    monkeypatch.setattr(growth, "agreeing", lambda *_: {k: np.eye(3) for k in range(held)})
+    monkeypatch.setattr(
+        growth, "largest_consistent_set", lambda *_: {k: np.eye(3) for k in range(held)}
+    )
     monkeypatch.setattr(growth, "placed_towards", lambda crop, rotation: np.eye(4))
     monkeypatch.setattr(growth, "start_photos", lambda *_: [0])
     done = (np.tile(np.eye(4), (photos, 1, 1)), np.full(photos, 0.9))
     monkeypatch.setattr(
         growth, "grow_set", lambda crops, poses, used, *_: grown.append(("set", used)) or done
     )
-    monkeypatch.setattr(growth, "grow", lambda *_: grown.append(("photo", None)) or done)
-    monkeypatch.setattr(growth, "settle", lambda *_: done)
+    monkeypatch.setattr(growth, "grow_photos", lambda *_: grown.append(("photo", None)) or done)
+    monkeypatch.setattr(growth, "settle_photos", lambda *_: done)
     said = []
     growth.poses_by_growth([None] * photos, 1, 1, 0, said.append)
     assert grown[0][0] == begins and bool(asked) == (photos >= 12)

@@ -44,7 +44,7 @@ def after_alignment(poses, photos):
 
 
 def test_a_rough_start_descends(photos):
-    from relit.fit.registration.photos.poses import descended, even_colours
+    from relit.fit.registration.photos.poses import even_colours, fit_with_free_poses
     from relit.fit.registration.register import crop_photo
 
     crops = even_colours([crop_photo(*p) for p in photos])
@@ -53,7 +53,7 @@ def test_a_rough_start_descends(photos):
     for pose in start:
         pose[:3] = exp_so3(rng.normal(size=3) * np.radians(5)) @ pose[:3]
     before = after_alignment(start, photos)
-    model, poses = descended(crops, start, 32, 60, 0)
+    model, poses = fit_with_free_poses(crops, start, 32, 60, 0)
     assert np.median(after_alignment(poses, photos)) < 0.6 * np.median(before)
     assert model.grid.n == 32
 
@@ -61,12 +61,12 @@ def test_a_rough_start_descends(photos):
 def test_only_the_lost_photo_moves(model, photos):
     from relit.fit.collection.held_out import look_again
     from relit.fit.collection.options import CollectionOptions
-    from relit.fit.collection.photos import Shot
+    from relit.fit.collection.photos import CollectionPhoto
 
     some = photos[:4]
     plain = [replace(c, world_from_camera=np.eye(4)) for *_, c in some]
     shots = [
-        Shot(SimpleNamespace(name=str(i)), rgb, mask, p, np.zeros(3))
+        CollectionPhoto(SimpleNamespace(name=str(i)), rgb, mask, p, np.zeros(3))
         for i, ((rgb, mask, _), p) in enumerate(zip(some, plain, strict=True))
     ]
     cameras = [c for *_, c in some]
@@ -96,15 +96,15 @@ def test_ablation_without_search_keeps_the_hints(photos):
 
 
 def test_agreement_tells_right_poses_from_wrong_ones(photos):
-    from relit.fit.registration.photos.poses import agreement, even_colours
+    from relit.fit.registration.photos.poses import cross_validated_share, even_colours
     from relit.fit.registration.register import crop_photo
 
     crops = even_colours([crop_photo(*p) for p in photos])
     right = np.array([c.world_from_camera for *_, c in photos])
     wrong = right[np.random.default_rng(3).permutation(len(right))]
     coarse = {"nodes": 24, "steps": 20, "views": 150, "within": 30.0}
-    assert agreement(crops, right, 0, **coarse) >= 0.5
-    assert agreement(crops, wrong, 0, **coarse) <= 0.2
+    assert cross_validated_share(crops, right, 0, **coarse) >= 0.5
+    assert cross_validated_share(crops, wrong, 0, **coarse) <= 0.2
 
 
 def test_settling_never_ends_worse_than_it_began(photos, monkeypatch):
@@ -125,23 +125,23 @@ def test_settling_never_ends_worse_than_it_began(photos, monkeypatch):
         lambda *_, **__: (poses, np.full(len(crops), next(means))),
     )
     rings = crop_rings(crops)
-    _, kept = collection_growth.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
+    _, kept = collection_growth.settle_photos(crops, poses, scores, rings, 1, 0, lambda *_: None)
     assert kept.mean() == pytest.approx(0.95)
     means = iter([0.5, 0.6, 0.7])
-    _, kept = collection_growth.settle(crops, poses, scores, rings, 1, 0, lambda *_: None)
+    _, kept = collection_growth.settle_photos(crops, poses, scores, rings, 1, 0, lambda *_: None)
     assert kept.mean() == pytest.approx(0.9)
 
 
 def test_settling_searches_and_refines_with_what_growth_compares(photos):
     """The whole of it, once: what is compared has as many parts everywhere."""
-    from relit.fit.registration.photos.growth import PARTS, settle
+    from relit.fit.registration.photos.growth import PARTS, settle_photos
     from relit.fit.registration.photos.poses import even_colours
     from relit.fit.registration.register import crop_photo, crop_rings
 
     some = photos[:5]
     crops = even_colours([crop_photo(*p) for p in some])
     poses = np.array([c.world_from_camera for *_, c in some])
-    settled, scores = settle(
+    settled, scores = settle_photos(
         crops,
         poses,
         np.zeros(len(crops)),

@@ -2,7 +2,7 @@
 
 The silhouette of a body of revolution tells all but that turn, and one that is mostly hidden may
 have been placed by it alone. A pattern matches itself within a few degrees, and only where the axis
-is right too. So the evidence of all turns names a few places (`agreement`), each of these is laid
+is right too. So the evidence of all turns names a few places (`pattern_evidence`), each of these is laid
 on its outline and descends then by what the others show too (one Gauss-Newton step of
 `fit.shape.alignment` after another, for the pose of this view alone): textures that are met from an
 axis that leans by two degrees would hold it there. Of where they end the one is taken at which the
@@ -18,8 +18,8 @@ import mitsuba as mi
 import numpy as np
 
 from relit.conventions import similarity
-from relit.fit.registration.instances.views import View
-from relit.fit.shape.alignment import LABELS, outline_rows, settled, solved, texture_rows
+from relit.fit.registration.instances.views import InstanceView
+from relit.fit.shape.alignment import LABELS, has_converged, outline_rows, solved, texture_rows
 from relit.fit.shape.outlines import follow_with_poses
 from relit.fit.shape.texture_shifts import (
     ACROSS,
@@ -29,10 +29,10 @@ from relit.fit.shape.texture_shifts import (
     Shown,
     around,
     brought_to,
-    channels_of,
     clear_of,
     contrasts,
-    met_by,
+    covisible_pixels,
+    display_channels,
     shifts_between,
     shown_by,
     structure_of,
@@ -57,8 +57,8 @@ EXPECTED = 0.6
 @dataclass(frozen=True)
 class Others:
     """What views at known poses show of a mesh, (h, w, 3) `channels` as
-    `texture_shifts.channels_of` has them against `tint`. clear: the structure from which on places
-    count in full, see `texture_shifts.shares`."""
+    `texture_shifts.display_channels` has them against `tint`. clear: the structure from which on places
+    count in full, see `texture_shifts.flow_weights`."""
 
     mesh: Mesh
     scene: mi.Scene
@@ -69,7 +69,7 @@ class Others:
     clear: float
 
 
-def others_of(mesh: Mesh, views: list[View], poses: np.ndarray) -> Others | None:
+def others_of(mesh: Mesh, views: list[InstanceView], poses: np.ndarray) -> Others | None:
     """Of views at poses (N, 4, 4); None where they do not tell the same place from another one: no
     texture."""
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
@@ -83,19 +83,19 @@ def others_of(mesh: Mesh, views: list[View], poses: np.ndarray) -> Others | None
         scene,
         cameras,
         masks,
-        [channels_of(p, tint) for p in pictures],
+        [display_channels(p, tint) for p in pictures],
         tint,
         clear_of(shifts),
     )
 
 
-def turned_alike(others: Others, view: View, pose: np.ndarray, axis: Axis) -> np.ndarray:
+def turned_alike(others: Others, view: InstanceView, pose: np.ndarray, axis: Axis) -> np.ndarray:
     """The pose (4, 4) of a view, right up to a turn about the axis, with which it shows what the
     others show. A guess even where one place
     is clearly the likeliest: half a turn of a pattern that repeats can look more alike than its
     own."""
     turns = all_turns(pose, axis, TURNS)
-    evidence = agreement(shrunk_others(others), shrunk(view), turns)
+    evidence = pattern_evidence(shrunk_others(others), shrunk_view(view), turns)
     peaks = np.flatnonzero((evidence >= np.roll(evidence, 1)) & (evidence >= np.roll(evidence, -1)))
     starts = [
         on_outline(others, view, turns[k]) for k in peaks[np.argsort(-evidence[peaks])[:PLACES]]
@@ -108,7 +108,7 @@ def turned_alike(others: Others, view: View, pose: np.ndarray, axis: Axis) -> np
     return ends[int(np.argmax([likelihood(others, view, p) for p in ends]))]
 
 
-def shrunk(view: View) -> View:
+def shrunk_view(view: InstanceView) -> InstanceView:
     """The view, its pictures SHRUNK: a pattern that is laid on itself within a few degrees is not
     told by its finest detail."""
     picture, mask, known = (smaller(a) for a in (view.rgb, view.mask, view.known))
@@ -122,7 +122,7 @@ def shrunk(view: View) -> View:
 
 
 def shrunk_others(others: Others) -> Others:
-    """As `shrunk`."""
+    """As `shrunk_view`."""
     masks, channels = [smaller(m) for m in others.masks], [smaller(c) for c in others.channels]
     cameras = [
         c.resized(m.shape[1], m.shape[0]) for c, m in zip(others.cameras, masks, strict=True)
@@ -153,17 +153,17 @@ def turned_by(pose: np.ndarray, axis: Axis, angle: float) -> np.ndarray:
     return similarity(turn, axis.point - turn @ axis.point) @ pose
 
 
-def agreement(others: Others, view: View, poses: np.ndarray) -> np.ndarray:
+def pattern_evidence(others: Others, view: InstanceView, poses: np.ndarray) -> np.ndarray:
     """(K,) evidence, for each of poses (K, 4, 4) of a view, that it shows the same pattern as those
     of the others that look from the
     nearest sides: - n / 2 log(1 - ρ²) for each, ρ the correlation of their brightness, freed of
     what is local, and n the patches that both show."""
-    own, out = channels_of(view.rgb, others.tint)[..., 0], []
+    own, out = display_channels(view.rgb, others.tint)[..., 0], []
     for pose in poses:
         evidence = 0.0
-        camera, shown = seen_from(others, view, pose)
+        camera, shown = view_at_pose(others, view, pose)
         for j in np.argsort(-cosines_to(others, camera))[:NEIGHBOURS]:
-            both, x, y = met_by(others.scene, shown, others.cameras[j], others.masks[j])
+            both, x, y = covisible_pixels(others.scene, shown, others.cameras[j], others.masks[j])
             if both.sum() < OVERLAP:
                 continue
             theirs = brought_to(shown, others.channels[j][..., 0], x, y)
@@ -173,16 +173,16 @@ def agreement(others: Others, view: View, poses: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def likelihood(others: Others, view: View, pose: np.ndarray) -> float:
+def likelihood(others: Others, view: InstanceView, pose: np.ndarray) -> float:
     """How much likelier it is that the view at a pose (4, 4) shows the same places as the others
     than that it shows unrelated ones, as a
     logarithm: each patch of each channel is a pair of normal variables, of the correlation EXPECTED
     or of none, and counts by its structure. So what one view shows clearly and another one does not
     speaks against the pose."""
-    own, total = channels_of(view.rgb, others.tint), 0.0
-    camera, shown = seen_from(others, view, pose)
+    own, total = display_channels(view.rgb, others.tint), 0.0
+    camera, shown = view_at_pose(others, view, pose)
     for j in np.flatnonzero(cosines_to(others, camera) > np.cos(np.radians(ACROSS))):
-        both, x, y = met_by(others.scene, shown, others.cameras[j], others.masks[j])
+        both, x, y = covisible_pixels(others.scene, shown, others.cameras[j], others.masks[j])
         if both.sum() < OVERLAP:
             continue
         for a, theirs in zip(
@@ -207,7 +207,7 @@ def correlation(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> tuple[float
     )
 
 
-def on_outline(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
+def on_outline(others: Others, view: InstanceView, pose: np.ndarray) -> np.ndarray:
     """The pose (4, 4) with which the mesh's outline lies on the view's mask where that is known;
     from one that is off by a few pixels."""
     camera, scene = view.camera.with_pose(pose), others.scene
@@ -216,11 +216,11 @@ def on_outline(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
     )[1][0]
 
 
-def descended_alike(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
+def descended_alike(others: Others, view: InstanceView, pose: np.ndarray) -> np.ndarray:
     """The pose (4, 4) of a view after at most ROUNDS steps by which what it shows comes to lie on
     what the others show, and its outline on the mask; the mesh and the others stay."""
     camera, mask = view.camera.with_pose(pose), view.mask * view.known
-    channels = [channels_of(view.rgb, others.tint), *others.channels]
+    channels = [display_channels(view.rgb, others.tint), *others.channels]
     for _ in range(ROUNDS):
         before, shown = camera, shown_by(others.mesh, others.scene, camera, mask)
         cameras, cosines = [camera, *others.cameras], cosines_to(others, camera)
@@ -239,12 +239,12 @@ def descended_alike(others: Others, view: View, pose: np.ndarray) -> np.ndarray:
             for r in (texture_rows(shifts, cameras) if shifts else [])
         ]
         camera = solved(others.mesh, [camera], rows, still=True)[1][0]
-        if settled([before], [camera]):
+        if has_converged([before], [camera]):
             break
     return np.asarray(camera.world_from_camera)
 
 
-def seen_from(others: Others, view: View, pose: np.ndarray) -> tuple[Camera, Shown]:
+def view_at_pose(others: Others, view: InstanceView, pose: np.ndarray) -> tuple[Camera, Shown]:
     """The view's camera at a pose (4, 4), and what it shows of the mesh."""
     camera = view.camera.with_pose(pose)
     return camera, shown_by(others.mesh, others.scene, camera, view.mask * view.known)

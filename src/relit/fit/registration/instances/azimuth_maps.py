@@ -89,7 +89,7 @@ class Board:
 
 
 @dataclass(frozen=True)
-class Told:
+class AzimuthEstimate:
     """What maps tell. poses: (N, 4, 4) with seat and turn put in. sure: (N,) bool, whose turn leads
     clearly over all others."""
 

@@ -9,13 +9,13 @@ import numpy as np
 
 from relit.fit.registration.instances.mirror_plane import Flipped, Plane, find_plane
 from relit.fit.registration.instances.options import Growth
-from relit.fit.registration.instances.views import View, albedo_render, fit_model, taut_body
+from relit.fit.registration.instances.views import InstanceView, albedo_render, fit_model, taut_body
 from relit.fit.registration.register import Gallery, Render, make_gallery
 from relit.scene import Camera
 
 
 @dataclass(frozen=True)
-class Body:
+class CoarseBody:
     """render: of the model. gallery: its renderings. poses: (N, 4, 4) of the instances, with the
     corrections of the fit. plane: of symmetry, or None."""
 
@@ -26,7 +26,7 @@ class Body:
 
 
 def body_of(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     cameras: list[Camera],
     parts,
@@ -36,19 +36,19 @@ def body_of(
     seed: int,
     pictures: Flipped | None = None,
     plane: Plane | None = None,
-) -> Body:
+) -> CoarseBody:
     """A model of `views` at `poses`, rendered for `cameras`; pictures: the views, flipped, for the
     plane to be sought. plane: the one of before (see `find_plane`), or, without pictures, the one
     that holds. Raises NoShape where the silhouettes have nothing in common."""
     if pictures is None:
-        return fitted(views, poses, cameras, parts, o, steps, seed, plane)
-    body = fitted(views, poses, cameras, parts, o, steps, seed, None)
+        return fit_body(views, poses, cameras, parts, o, steps, seed, plane)
+    body = fit_body(views, poses, cameras, parts, o, steps, seed, None)
     found = find_plane(views, pictures, body.poses, body.gallery, body.render, parts, last=plane)
-    return body if found is None else fitted(views, poses, cameras, parts, o, steps, seed, found)
+    return body if found is None else fit_body(views, poses, cameras, parts, o, steps, seed, found)
 
 
-def fitted(
-    views: list[View],
+def fit_body(
+    views: list[InstanceView],
     poses: np.ndarray,
     cameras: list[Camera],
     parts,
@@ -56,7 +56,7 @@ def fitted(
     steps: int,
     seed: int,
     plane: Plane | None,
-) -> Body:
+) -> CoarseBody:
     """`body_of` with what is known of the plane. A photo of an object that is its own mirror image
     is as well the photo that a mirrored
     camera takes of it: such cameras stand beside the others, and since the light stands with the
@@ -69,4 +69,4 @@ def fitted(
         views, poses, values, steps, refine_cameras=o.rate, rays=o.rays, seed=seed
     )
     render = albedo_render(model)
-    return Body(render, make_gallery(render, cameras, parts), moved[:count], plane)
+    return CoarseBody(render, make_gallery(render, cameras, parts), moved[:count], plane)

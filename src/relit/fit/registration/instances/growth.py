@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from relit.conventions import similarity
-from relit.fit.registration.instances.bodies import Body, body_of
+from relit.fit.registration.instances.bodies import CoarseBody, body_of
 from relit.fit.registration.instances.lookahead import branch_values
 from relit.fit.registration.instances.mirror_plane import flipped_views
 from relit.fit.registration.instances.options import Growth
-from relit.fit.registration.instances.views import View, eyes_at, first_pose
+from relit.fit.registration.instances.views import InstanceView, eyes_at, first_pose
 from relit.fit.registration.register import (
     Crop,
     Rings,
@@ -38,7 +38,7 @@ FEW = 4  # members; fewer than that, which do not tell a plane of symmetry, need
 AT_ONCE = 12
 
 
-def seen_from(poses: np.ndarray) -> np.ndarray:
+def viewing_directions(poses: np.ndarray) -> np.ndarray:
     """Unit vectors (N, 3) from the object's middle to the cameras."""
     c = poses[:, :3, 3]
     return c / np.linalg.norm(c, axis=1, keepdims=True)
@@ -55,8 +55,8 @@ class Grown:
     unsure: tuple[int, ...]
 
 
-def grow(
-    views: list[View],
+def grow_instances(
+    views: list[InstanceView],
     crops: list[Crop],
     rings: Rings,
     parts,
@@ -78,7 +78,7 @@ def grow(
     flipped = flipped_views(views, parts)
     members, expelled, turn = list(members), Counter(), 0
     firm, unsure = list(members), []
-    body: Body | None = None
+    body: CoarseBody | None = None
     while True:
         turn += 1
         some, cameras = (
@@ -156,7 +156,7 @@ def grow(
             members.append(k)
 
 
-def standing(places: np.ndarray, heights: np.ndarray, chosen: int) -> float:
+def lead_over_second(places: np.ndarray, heights: np.ndarray, chosen: int) -> float:
     """By how much one of the places (K, 4, 4) of an instance scores better than the best that is
     ANOTHER degrees away from it or more."""
     away = [rotation_angle(places[chosen, :3, :3].T @ p[:3, :3]) >= ANOTHER for p in places]
@@ -167,7 +167,10 @@ def lead(places: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """(R,) by how much the best of the places (K, R, 4, 4) of each scores better than the best one
     that is ANOTHER degrees away from it or more; heights: (K, R) their scores."""
     return np.array(
-        [standing(places[:, i], heights[:, i], best) for i, best in enumerate(heights.argmax(0))]
+        [
+            lead_over_second(places[:, i], heights[:, i], best)
+            for i, best in enumerate(heights.argmax(0))
+        ]
     )
 
 
@@ -205,7 +208,7 @@ def ahead(
         branches.append(([*members, rest[i]], joined))
     value = branch_values(views, crops, rings, parts, branches, o, seed, flipped, plane)
     value = value + TRUST * np.array(
-        [standing(places[:, i], heights[:, i], place) for place, i in tried]
+        [lead_over_second(places[:, i], heights[:, i], place) for place, i in tried]
     )
     if rng is not None:
         value = value + o.leap * rng.gumbel(size=len(value))
@@ -217,7 +220,7 @@ def registered(
     crops,
     rings: Rings,
     parts,
-    body: Body,
+    body: CoarseBody,
     poses,
     members: list[int],
     rest: list[int],
@@ -252,7 +255,9 @@ def linked_poses(
     return out
 
 
-def linked_pose(view: View, pose: np.ndarray, turn: np.ndarray, distance: float) -> np.ndarray:
+def linked_pose(
+    view: InstanceView, pose: np.ndarray, turn: np.ndarray, distance: float
+) -> np.ndarray:
     """Pose of `view`, in the middle of its silhouette, turned in the photo by `turn` against an
     instance in `pose`."""
     own = pose[:3, :3] @ turn.T

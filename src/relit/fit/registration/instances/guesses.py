@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relit.fit.registration.instances.growth import ANOTHER, seen_from
+from relit.fit.registration.instances.growth import ANOTHER, viewing_directions
 from relit.fit.registration.instances.options import COLOURFUL, DETAILED, Search
 from relit.fit.registration.instances.views import (
-    View,
+    InstanceView,
     albedo_render,
     first_pose,
     fit_model,
-    inflated,
+    inflate_silhouette,
 )
 from relit.fit.registration.register import (
     crop_rings,
@@ -44,7 +44,7 @@ class Guesses:
 
 
 def pair_guesses(
-    views: list[View], crops, chosen: list[int], o: Search, distance: float, seed: int, say
+    views: list[InstanceView], crops, chosen: list[int], o: Search, distance: float, seed: int, say
 ) -> dict[tuple, Guesses]:
     """Guesses under each of two descriptors (DETAILED, COLOURFUL): every chosen instance is
     inflated to a model, and every other one is registered against it, `o.keep` ways."""
@@ -57,9 +57,9 @@ def pair_guesses(
     for s, k in enumerate(chosen):
         pose = first_pose(views[k], distance)
         model, _ = fit_model(
-            [views[k]], pose[None], inflated(views[k], pose, o.nodes), o.steps, seed=seed
+            [views[k]], pose[None], inflate_silhouette(views[k], pose, o.nodes), o.steps, seed=seed
         )
-        close = directions @ seen_from(pose[None])[0] >= np.cos(np.radians(o.cone))
+        close = directions @ viewing_directions(pose[None])[0] >= np.cos(np.radians(o.cone))
         cameras = views_from(directions[close], max(2.0, distance))
         galleries = make_galleries(albedo_render(model), cameras, out)
         for gallery, (parts, guesses) in zip(galleries, out.items(), strict=True):

@@ -11,10 +11,15 @@ from __future__ import annotations
 import numpy as np
 
 from relit.fit.registration.instances.bodies import body_of
-from relit.fit.registration.instances.growth import ANOTHER, linked_pose, registered, standing
+from relit.fit.registration.instances.growth import (
+    ANOTHER,
+    lead_over_second,
+    linked_pose,
+    registered,
+)
 from relit.fit.registration.instances.lookahead import Branch
 from relit.fit.registration.instances.options import Growth
-from relit.fit.registration.instances.views import View, eyes_at, first_pose
+from relit.fit.registration.instances.views import InstanceView, eyes_at, first_pose
 from relit.fit.registration.register import Crop, Rings, directions_around, views_from
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import rotation_angle
@@ -51,8 +56,8 @@ def linked_sets(views, links, distance: float) -> list[Branch]:
     return sorted(sets, key=lambda one: -len(one[0]))
 
 
-def borne_out(
-    views: list[View],
+def verified_links(
+    views: list[InstanceView],
     crops: list[Crop],
     rings: Rings,
     parts,
@@ -92,4 +97,4 @@ def leads_there(
     places, heights = registered(views, crops, rings, parts, body, now, rest, [k], o, links)
     best = int(heights[:, 0].argmax())
     there = rotation_angle(places[best, 0, :3, :3].T @ poses[k][:3, :3]) < ANOTHER
-    return bool(there and standing(places[:, 0], heights[:, 0], best) >= o.sure)
+    return bool(there and lead_over_second(places[:, 0], heights[:, 0], best) >= o.sure)

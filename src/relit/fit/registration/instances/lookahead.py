@@ -13,7 +13,7 @@ import numpy as np
 from relit.fit.registration.instances.bodies import body_of
 from relit.fit.registration.instances.mirror_plane import Flipped, Plane
 from relit.fit.registration.instances.options import Growth
-from relit.fit.registration.instances.views import View, eyes_at
+from relit.fit.registration.instances.views import InstanceView, eyes_at
 from relit.fit.registration.register import (
     Crop,
     Rings,
@@ -29,7 +29,7 @@ Branch = tuple[list[int], np.ndarray]  # members, and poses (N, 4, 4) of which t
 
 
 def branch_values(
-    views: list[View],
+    views: list[InstanceView],
     crops: list[Crop],
     rings: Rings,
     parts,

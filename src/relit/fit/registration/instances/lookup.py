@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.fit.registration.register import Crop, Gallery, Hypotheses, Rings, rings_of, search
 from relit.geometry.se3 import rotation_angle
 
@@ -22,7 +22,7 @@ SIZES = (0.85, 1.0, 1.15)  # times the usual spread of the renderings
 
 
 def look_for(
-    views: list[View],
+    views: list[InstanceView],
     crops: list[Crop],
     gallery: Gallery,
     rings: Rings,

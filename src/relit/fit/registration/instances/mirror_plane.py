@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relit.fit.registration.instances.views import View, crops_of, nearest_pixels
+from relit.fit.registration.instances.views import InstanceView, instance_crops, nearest_pixels
 from relit.fit.registration.register import (
     TURNS,
     Crop,
@@ -75,13 +75,13 @@ class Flipped:
         return Flipped([self.crops[k] for k in chosen], chosen_rings(self.rings, chosen))
 
 
-def flipped_views(views: list[View], parts) -> Flipped:
+def flipped_views(views: list[InstanceView], parts) -> Flipped:
     """All views, flipped. The cameras' poses stay: they are those of the photo that is flipped."""
-    crops = crops_of([flip(v) for v in views])
+    crops = instance_crops([flip(v) for v in views])
     return Flipped(crops, crop_rings(crops, parts))
 
 
-def flip(view: View) -> View:
+def flip(view: InstanceView) -> InstanceView:
     """A view of the mirrored object. Its normal prior stays behind: registration does not look at
     it."""
     camera = replace(view.camera, cx=view.camera.width - view.camera.cx)
@@ -90,7 +90,7 @@ def flip(view: View) -> View:
 
 
 def find_plane(
-    views: list[View],
+    views: list[InstanceView],
     pictures: Flipped,
     poses: np.ndarray,
     gallery: Gallery,
@@ -109,13 +109,13 @@ def find_plane(
     half = directions_around(2 * NORMALS)
     normals = half[half[:, 2] > 0]
     score = plane_scores(normals, pictures, poses, gallery)
-    hull = Hull(views, poses)
+    hull = HullPoints(views, poses)
     # the likeliest by appearance, and the likeliest of other directions, so that the best one has
     # others to lead over
-    judged = np.unique([*np.argsort(-score)[:JUDGED], *apart(normals, score)[:OTHERS]])
+    judged = np.unique([*np.argsort(-score)[:JUDGED], *distinct_planes(normals, score)[:OTHERS]])
     shares, offsets = np.array([hull.offset(n) for n in normals[judged]]).T
     normals, score = normals[judged], score[judged] + COVER * shares
-    chosen = apart(normals, score)[:SETTLED]
+    chosen = distinct_planes(normals, score)[:SETTLED]
     looked_at = [
         settled_plane(Plane(normals[k], offsets[k]), hull, pictures, poses, render, parts, last)
         for k in chosen
@@ -124,7 +124,7 @@ def find_plane(
     return plane if best - others[0][0] >= (LEAD if len(poses) > 2 else LEAD_OF_TWO) else None
 
 
-def apart(normals: np.ndarray, score: np.ndarray) -> list[int]:
+def distinct_planes(normals: np.ndarray, score: np.ndarray) -> list[int]:
     """Planes from the best score down, each ANOTHER_PLANE degrees or more from those before it."""
     chosen: list[int] = []
     for k in np.argsort(-score).tolist():
@@ -135,7 +135,7 @@ def apart(normals: np.ndarray, score: np.ndarray) -> list[int]:
 
 def settled_plane(
     first: Plane,
-    hull: Hull,
+    hull: HullPoints,
     pictures: Flipped,
     poses: np.ndarray,
     render: Render,
@@ -167,10 +167,10 @@ def settled_plane(
     return float(own.mean()) + COVER * share + kept, Plane(better, offset)
 
 
-class Hull:
+class HullPoints:
     """What lies inside all silhouettes, as points (P, 3)."""
 
-    def __init__(self, views: list[View], poses: np.ndarray):
+    def __init__(self, views: list[InstanceView], poses: np.ndarray):
         self.views, self.cameras = (
             views,
             [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)],
@@ -204,17 +204,19 @@ class Hull:
             )
         return float(share.max()), float(OFFSETS[share > share.max() - EVEN].mean())
 
-    def covered(self, points: np.ndarray, view: View, camera: Camera, outline: np.ndarray) -> float:
+    def covered(
+        self, points: np.ndarray, view: InstanceView, camera: Camera, outline: np.ndarray
+    ) -> float:
         u, v, ok = nearest_pixels(camera, points)
         return float((binned(v[ok], u[ok], view) > 0)[outline].mean()) if outline.any() else 0.0
 
 
-def cell(view: View) -> float:
+def cell(view: InstanceView) -> float:
     """Pixels of a bin's side."""
     return max(view.mask.shape) / BINS
 
 
-def binned(rows: np.ndarray, columns: np.ndarray, view: View) -> np.ndarray:
+def binned(rows: np.ndarray, columns: np.ndarray, view: InstanceView) -> np.ndarray:
     """(BINS + 1, BINS + 1) how many of the pixels fall into each bin of a view's window."""
     out = np.zeros((BINS + 1, BINS + 1), int)
     np.add.at(out, ((rows / cell(view)).astype(int), (columns / cell(view)).astype(int)), 1)

@@ -51,7 +51,7 @@ def alike_turns(gallery: Gallery, count: int) -> list[AlikeTurn]:
                 for rotation in (exp_so3(2 * np.pi / order * axis) for order in ORDERS)
             ]
     settled: list[tuple[float, np.ndarray]] = []
-    for _, start in apart(tried, SETTLED):
+    for _, start in distinct_rotations(tried, SETTLED):
         simplex = np.concatenate([np.zeros((1, 3)), STEP * np.eye(3)])
         found = minimize(
             lambda w, start=start: (
@@ -62,10 +62,12 @@ def alike_turns(gallery: Gallery, count: int) -> list[AlikeTurn]:
             options={"maxfev": TRIES, "initial_simplex": simplex},
         )
         settled.append((-found.fun, exp_so3(found.x) @ start))
-    return [as_turn(rotation, value) for value, rotation in apart(settled, count)]
+    return [as_turn(rotation, value) for value, rotation in distinct_rotations(settled, count)]
 
 
-def apart(found: list[tuple[float, np.ndarray]], count: int) -> list[tuple[float, np.ndarray]]:
+def distinct_rotations(
+    found: list[tuple[float, np.ndarray]], count: int
+) -> list[tuple[float, np.ndarray]]:
     """The best `count` of (value, rotation) that are turned against each other, and against each
     other's inverses, by ANOTHER or more."""
     kept: list[tuple[float, np.ndarray]] = []

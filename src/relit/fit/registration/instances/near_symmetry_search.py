@@ -18,14 +18,14 @@ import numpy as np
 from scipy.optimize import minimize
 
 from relit.conventions import similarity
-from relit.fit.registration.instances.bodies import Body, body_of
+from relit.fit.registration.instances.bodies import CoarseBody, body_of
 from relit.fit.registration.instances.growth import ANOTHER, registered
 from relit.fit.registration.instances.near_symmetry import AlikeTurn, alike_turns, as_turn
 from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.regrowth import NO_GAIN
 from relit.fit.registration.instances.rounds import model_of_all
 from relit.fit.registration.instances.silhouette_turns import FINE, NODES, Silhouettes
-from relit.fit.registration.instances.views import View, eyes_at, overlaps
+from relit.fit.registration.instances.views import InstanceView, eyes_at, overlaps
 from relit.fit.registration.register import (
     Crop,
     Rings,
@@ -71,7 +71,7 @@ class Asked:
     fine model, which coarse ones would lead
     away: they are turned, but do not move."""
 
-    views: list[View]
+    views: list[InstanceView]
     crops: list[Crop]
     rings: Rings
     options: Search
@@ -83,11 +83,11 @@ class Asked:
         """Of the body that silhouettes are held against, a side."""
         return FINE if self.exact else NODES
 
-    def model(self, poses: np.ndarray, trial: int = 0) -> Body:
+    def model(self, poses: np.ndarray, trial: int = 0) -> CoarseBody:
         """A model of all, fitted to poses (N, 4, 4). Raises NoShape."""
         return model_at(self.views, poses, self.options, self.seed + trial)
 
-    def settled(self, body: Body, poses: np.ndarray) -> np.ndarray:
+    def settled(self, body: CoarseBody, poses: np.ndarray) -> np.ndarray:
         """Poses (N, 4, 4) after a descent against a model."""
         return refine(
             self.crops, poses, body.render, rings=self.rings, steps=(0, 4.0, 2.0), parts=DETAILED
@@ -95,7 +95,7 @@ class Asked:
 
 
 def coherent_turns(
-    views: list[View],
+    views: list[InstanceView],
     crops: list[Crop],
     rings: Rings,
     poses: np.ndarray,
@@ -119,7 +119,7 @@ def coherent_turns(
             sought = by_silhouettes(asked, body, poses if exact else body.poses, turn)
             if sought is None:
                 continue
-            first = first or judged(asked, poses)
+            first = first or score_settled_poses(asked, poses)
             best = one_at_a_time(asked, sought, turn)
         except NoShape:  # turned so, the silhouettes have nothing in common
             continue
@@ -170,13 +170,13 @@ def stands(
     )
 
 
-def model_at(views, poses: np.ndarray, o: Search, seed: int) -> Body:
+def model_at(views, poses: np.ndarray, o: Search, seed: int) -> CoarseBody:
     cameras = views_from(directions_around(o.growth.viewpoints, seed), eyes_at(poses))
     return body_of(views, poses, cameras, DETAILED, o.growth, steps=o.growth.steps, seed=seed)
 
 
 def by_silhouettes(
-    asked: Asked, body: Body, poses: np.ndarray, turn: AlikeTurn
+    asked: Asked, body: CoarseBody, poses: np.ndarray, turn: AlikeTurn
 ) -> np.ndarray | None:
     """Poses (N, 4, 4) after the turns that silhouettes ask for; None where they ask for none. body:
     a model of all, `poses` those in it."""
@@ -206,7 +206,7 @@ def motions_about(turn: AlikeTurn, point: np.ndarray) -> np.ndarray:
 
 
 def placed_axis(
-    asked: Asked, body: Body, poses: np.ndarray, turn: AlikeTurn
+    asked: Asked, body: CoarseBody, poses: np.ndarray, turn: AlikeTurn
 ) -> tuple[AlikeTurn, np.ndarray]:
     """The turn, and a point of its axis, by which the model looks most like itself: all instances
     are registered from where it puts them."""
@@ -244,7 +244,7 @@ def axis_moved(
     return point + across @ found.x
 
 
-def judged(asked: Asked, poses: np.ndarray) -> Turned:
+def score_settled_poses(asked: Asked, poses: np.ndarray) -> Turned:
     """What a model of all says of poses, after they have settled on models of all unless they are
     exact."""
     for trial in range(0 if asked.exact else SETTLED):
@@ -263,7 +263,7 @@ def judged(asked: Asked, poses: np.ndarray) -> Turned:
 def one_at_a_time(asked: Asked, poses: np.ndarray, turn: AlikeTurn) -> Turned:
     """The best of those that differ in the turn of a single instance, again and again."""
     count = len(poses)
-    best, none = judged(asked, poses), np.zeros(count, int)
+    best, none = score_settled_poses(asked, poses), np.zeros(count, int)
     for _ in range(SWEEPS):
         before = best
         motions = motions_about(*placed_axis(asked, asked.model(best.poses), best.poses, turn))
@@ -273,7 +273,7 @@ def one_at_a_time(asked: Asked, poses: np.ndarray, turn: AlikeTurn) -> Turned:
         for k, s in ways[:ASKED]:
             other = best.poses.copy()
             other[k] = motions[s] @ other[k]
-            tried = judged(asked, other)
+            tried = score_settled_poses(asked, other)
             if tried.value > best.value + NO_GAIN:
                 best = tried
         if best is before:

@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 
 from relit.fit.registration.instances.azimuth_maps import (
+    AzimuthEstimate,
     Cells,
     Evidence,
-    Told,
     best_laid,
     cells_read,
     leads_of,
     turned_about,
 )
 from relit.fit.registration.instances.revolution import drawn, radius_at
-from relit.fit.registration.instances.views import View, best_seen, nearest_pixels
+from relit.fit.registration.instances.views import InstanceView, best_seen, nearest_pixels
 
 TURNS, RADII, HEIGHTS = 72, 9, 22  # cells around the body
 MAP = RADII * HEIGHTS, TURNS  # of fit/registration/instances/azimuth_maps.py
@@ -81,7 +81,7 @@ def wider(mask: np.ndarray, share: float) -> np.ndarray:
     return cv2.dilate((mask > 0.5).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1))) > 0
 
 
-def cells_of(view: View, profile: np.ndarray, pose: np.ndarray) -> Cells:
+def protrusion_cells(view: InstanceView, profile: np.ndarray, pose: np.ndarray) -> Cells:
     """What a view shows of the cells around the body."""
     points, outside = cells_around(profile)
     camera = view.camera.with_pose(pose)
@@ -99,10 +99,14 @@ def cells_of(view: View, profile: np.ndarray, pose: np.ndarray) -> Cells:
     )
 
 
-def turned_by_outline(views: list[View], profile: np.ndarray, poses: np.ndarray) -> Told | None:
+def turned_by_outline(
+    views: list[InstanceView], profile: np.ndarray, poses: np.ndarray
+) -> AzimuthEstimate | None:
     """The turns of views whose axes are known (poses: (N, 4, 4)); None where fewer than FEWEST are
     sure of theirs."""
-    read = [[cells_of(view, profile, pose)] for view, pose in zip(views, poses, strict=True)]
+    read = [
+        [protrusion_cells(view, profile, pose)] for view, pose in zip(views, poses, strict=True)
+    ]
     _, seats, turns = best_laid(read, best_seen(views)[:AT_ONCE], FILLED_OR_EMPTY, MAP)
     show = np.array([(one.values > 0).sum() for (one,) in read])
     sure = (show >= SOME) & (
@@ -112,4 +116,4 @@ def turned_by_outline(views: list[View], profile: np.ndarray, poses: np.ndarray)
     turned = np.array(
         [turned_about(pose, t * 2 * np.pi / TURNS) for pose, t in zip(poses, turns, strict=True)]
     )
-    return Told(turned, sure) if sure.sum() >= FEWEST else None
+    return AzimuthEstimate(turned, sure) if sure.sum() >= FEWEST else None

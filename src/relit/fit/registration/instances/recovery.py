@@ -26,9 +26,9 @@ from relit.fit.registration.instances.options import DETAILED
 from relit.fit.registration.instances.outliers import view_errors
 from relit.fit.registration.instances.revolution import UP
 from relit.fit.registration.instances.views import (
-    View,
+    InstanceView,
     albedo_render,
-    crops_of,
+    instance_crops,
     move_poses,
     moved_poses,
     overlaps,
@@ -81,8 +81,8 @@ STEPS, RAYS, RATE = 250, 8192, 0.006  # of their descent
 
 
 def sought_again(
-    view: View,
-    guide: View,
+    view: InstanceView,
+    guide: InstanceView,
     guide_pose: np.ndarray,
     model: VolumeModel,
     level: float,
@@ -90,7 +90,7 @@ def sought_again(
     galleries: Callable[[int], list[Gallery]],
     seed: int = 0,
     on_axis: np.ndarray | None = None,
-    turned: Callable[[View, np.ndarray], np.ndarray] | None = None,
+    turned: Callable[[InstanceView, np.ndarray], np.ndarray] | None = None,
     guess: bool = False,
 ):
     """(pose (4, 4) of `view` in the model or None, is that certain): None where what it shows
@@ -115,10 +115,12 @@ def sought_again(
         )
         if len(poses) == 0:
             continue
-        poses, errors = descended(view, guide, guide_pose, poses, model, turns, STEPS, seed + turn)
+        poses, errors = refine_candidates(
+            view, guide, guide_pose, poses, model, turns, STEPS, seed + turn
+        )
         if np.isnan(errors).all():  # none of its pixels is whole: it tells nothing
             break
-        pose, certain = likeliest(poses, errors, level)
+        pose, certain = most_likely_pose(poses, errors, level)
         if certain:
             return pose, True
         if on_axis is not None:
@@ -126,15 +128,15 @@ def sought_again(
         if turned is not None:
             there = where_outlines_agree(errors, view, poses, model)
             if np.isfinite(there).any():
-                return turned(view, likeliest(poses, there, level)[0]), False
+                return turned(view, most_likely_pose(poses, there, level)[0]), False
         if guess:
             if np.nanmin(errors) > HOPELESS * level:
                 break
             best = best_places(poses, errors)[:MORE]
-            poses, errors = descended(
+            poses, errors = refine_candidates(
                 view, guide, guide_pose, poses[best], model, turns, LONGER, seed + turn
             )
-            pose, certain = likeliest(poses, errors, level)
+            pose, certain = most_likely_pose(poses, errors, level)
             if certain or worth_a_trial(poses, errors, level):
                 return pose, certain
         if np.nanmin(errors) <= AGREES * level:
@@ -142,7 +144,9 @@ def sought_again(
     return None, False
 
 
-def likeliest(poses: np.ndarray, errors: np.ndarray, level: float) -> tuple[np.ndarray, bool]:
+def most_likely_pose(
+    poses: np.ndarray, errors: np.ndarray, level: float
+) -> tuple[np.ndarray, bool]:
     """(the pose with the least of the errors (K,), is it certain: it agrees, and clearly better
     than any other place does). level: see `sought_again`."""
     best, *others = best_places(poses, errors)
@@ -170,7 +174,7 @@ def best_places(poses: np.ndarray, errors: np.ndarray) -> list[int]:
 
 
 def where_outlines_agree(
-    errors: np.ndarray, view: View, poses: np.ndarray, model: VolumeModel
+    errors: np.ndarray, view: InstanceView, poses: np.ndarray, model: VolumeModel
 ) -> np.ndarray:
     """The errors (K,) of places whose silhouettes agree with the view's, and about as well as the
     best of them, nan for others."""
@@ -186,9 +190,9 @@ def galleries_of(model: VolumeModel, distance: float, seed: int) -> list[Gallery
     )
 
 
-def candidates(view: View, model: VolumeModel, galleries: list[Gallery]) -> np.ndarray:
+def candidates(view: InstanceView, model: VolumeModel, galleries: list[Gallery]) -> np.ndarray:
     """(at most TRIES, 4, 4) places that look most like the view, by rendering."""
-    crops, render = crops_of([view]), albedo_render(model)
+    crops, render = instance_crops([view]), albedo_render(model)
     found = []
     for parts, gallery in zip(PLACED, galleries, strict=True):
         rings = crop_rings(crops, parts)
@@ -202,9 +206,9 @@ def candidates(view: View, model: VolumeModel, galleries: list[Gallery]) -> np.n
     return np.array(found)
 
 
-def descended(
-    view: View,
-    guide: View,
+def refine_candidates(
+    view: InstanceView,
+    guide: InstanceView,
     guide_pose: np.ndarray,
     poses: np.ndarray,
     model: VolumeModel,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relit.fit.registration.instances.growth import Grown, grow, seen_from
+from relit.fit.registration.instances.growth import Grown, grow_instances, viewing_directions
 from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.rounds import LOW, SLACK, model_of_all
 from relit.fit.registration.register import Rings
@@ -46,7 +46,7 @@ class Placed:
         return float(self.own.mean())
 
 
-def judged(views, grown: Grown, parts, o: Search, seed: int) -> Placed | None:
+def score_growth(views, grown: Grown, parts, o: Search, seed: int) -> Placed | None:
     """What a model of all says of what has grown; None where the silhouettes have nothing in
     common."""
     try:
@@ -82,7 +82,7 @@ def grown_again(
     """The set with all but those who stay taken out and grown again; None where the silhouettes
     have nothing in common."""
     try:
-        grown = grow(
+        grown = grow_instances(
             views,
             crops,
             rings,
@@ -96,7 +96,7 @@ def grown_again(
         )
     except NoShape:
         return None
-    again = judged(views, grown, parts, o, seed)
+    again = score_growth(views, grown, parts, o, seed)
     if again is None:
         return None
     doubtful = set(stay) & set(placed.unsure)
@@ -184,6 +184,6 @@ def staying(placed: Placed, turn: int, rng) -> list[int]:
     stay = max(2, int(rng.integers(round(KEPT[0] * count), round(KEPT[1] * count) + 1)))
     if turn % 4 == 1:
         return np.argsort(-(own + WAVER * rng.standard_normal(count)))[:stay].tolist()
-    sides = seen_from(placed.poses)
+    sides = viewing_directions(placed.poses)
     likely = np.exp((own - own.max()) / WAVER)
     return np.argsort(-(sides @ sides[rng.choice(count, p=likely / likely.sum())]))[:stay].tolist()

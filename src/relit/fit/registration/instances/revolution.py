@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from relit.conventions import similarity
-from relit.fit.registration.instances.views import View, nearest_pixels
+from relit.fit.registration.instances.views import InstanceView, nearest_pixels
 from relit.fit.registration.register import AHEAD, Gallery, moments, rings_of, views_from
 from relit.geometry.se3 import rotation_from
 from relit.scene import Camera
@@ -110,7 +110,7 @@ def leaning_back(pose: np.ndarray) -> np.ndarray:
 
 
 def mirror_lines(
-    view: View, keep: int = 3, apart: float = 24.0
+    view: InstanceView, keep: int = 3, apart: float = 24.0
 ) -> list[tuple[float, float, float]]:
     """(angle in radians, x, y in pixels) of the lines on which a silhouette is most nearly its own
     mirror image; `apart` degrees."""
@@ -151,7 +151,7 @@ def mirror_lines(
     ]
 
 
-def poses_on_lines(view: View, distance: float) -> list[np.ndarray]:
+def poses_on_lines(view: InstanceView, distance: float) -> list[np.ndarray]:
     """Poses (4, 4) whose axis is seen on one of the silhouette's mirror lines, under every tilt."""
     out = []
     for angle, x, y in mirror_lines(view):
@@ -169,7 +169,7 @@ def poses_on_lines(view: View, distance: float) -> list[np.ndarray]:
     return out
 
 
-def revolved_silhouette(view: View, pose: np.ndarray) -> np.ndarray | None:
+def revolved_silhouette(view: InstanceView, pose: np.ndarray) -> np.ndarray | None:
     """The profile of what stays inside the silhouette in nearly all turns about the axis; None
     where nothing does."""
     heights, radii = CELLS

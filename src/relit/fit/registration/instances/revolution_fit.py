@@ -29,7 +29,7 @@ from relit.fit.registration.instances.revolution import (
     revolved_silhouette,
     tilted_gallery,
 )
-from relit.fit.registration.instances.views import View, best_seen, eyes_at, frame_scale
+from relit.fit.registration.instances.views import InstanceView, best_seen, eyes_at, frame_scale
 from relit.fit.registration.register import Crop, Rings, all_scores, crop_rings, search
 from relit.geometry.se3 import exp_so3, hat, rotation_angle, rotation_from
 
@@ -48,7 +48,9 @@ TRIMMED = (
 )  # shares of the views, those that fit best, which shape the profile in turn
 BLUR = 1.2  # pixels of a crop by which outlines are blurred: as far as they pull
 BESIDE = 0.5  # weight of what a silhouette shows beside the body
-STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])  # of the finite differences of a pose, see `moved`
+STEPS = np.array(
+    [0.05, 0.05, 0.02, 0.02, 0.02]
+)  # of the finite differences of a pose, see `moved_pose`
 DAMPING = 0.02
 SMOOTH = 0.02  # of a profile's bends, for each view
 AS_WELL = (
@@ -61,7 +63,7 @@ APART = 15.0  # degrees between the axes of two seats
 @dataclass(frozen=True)
 class Revolved:
     """profile: see fit/registration/instances/revolution.py. poses: (N, 4, 4). misfits: (N,) of the
-    views, see `misfit`."""
+    views, see `crop_misfit`."""
 
     profile: np.ndarray
     poses: np.ndarray
@@ -74,7 +76,7 @@ class Revolved:
 
 
 @dataclass(frozen=True)
-class Outline:
+class CropOutline:
     """What a crop is compared by. mask: (S, S) blurred. weight: (S, S), over the root of the
     silhouette's area."""
 
@@ -85,7 +87,7 @@ class Outline:
     def residual(self, profile: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """(S, S) drawn silhouette - mask, blurred."""
         return (
-            blurred(
+            blurred_mask(
                 drawn(
                     profile, self.crop.camera.with_pose(pose @ self.crop.camera.world_from_camera)
                 )
@@ -102,21 +104,21 @@ class Outline:
         return np.array([((w * (r - residual)) / step).ravel() for step, r in others])
 
 
-def blurred(picture: np.ndarray) -> np.ndarray:
+def blurred_mask(picture: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR)
 
 
-def outline_of(crop: Crop) -> Outline:
-    known, mask = (crop.weight > 0.5).astype(np.float32), blurred(crop.mask)
-    return Outline(crop, mask, known / np.sqrt(max(float((mask * known).sum()), 1.0)))
+def crop_outline(crop: Crop) -> CropOutline:
+    known, mask = (crop.weight > 0.5).astype(np.float32), blurred_mask(crop.mask)
+    return CropOutline(crop, mask, known / np.sqrt(max(float((mask * known).sum()), 1.0)))
 
 
-def misfit(outline: Outline, residual: np.ndarray) -> float:
+def crop_misfit(outline: CropOutline, residual: np.ndarray) -> float:
     """Sum of squared weighted residuals, over the area of the silhouette."""
     return float(((outline.weights(residual) * residual) ** 2).sum())
 
 
-def moved(pose: np.ndarray, x: np.ndarray) -> np.ndarray:
+def moved_pose(pose: np.ndarray, x: np.ndarray) -> np.ndarray:
     """x: turns across the axis (2, radians), shifts across the line of sight (2, unit lengths), log
     distance."""
     turn, middle = (
@@ -131,22 +133,22 @@ def moved(pose: np.ndarray, x: np.ndarray) -> np.ndarray:
     return similarity(turn, -turn @ middle)
 
 
-def pose_slopes(outline: Outline, profile, pose, residual) -> np.ndarray:
+def pose_slopes(outline: CropOutline, profile, pose, residual) -> np.ndarray:
     return outline.slopes(
         residual,
         [
-            (s, outline.residual(profile, moved(pose, s * e)))
+            (s, outline.residual(profile, moved_pose(pose, s * e)))
             for s, e in zip(STEPS, np.eye(5), strict=True)
         ],
     )
 
 
 def adjusted_pose(
-    outline: Outline, profile: np.ndarray, pose: np.ndarray, rounds: int = 6
+    outline: CropOutline, profile: np.ndarray, pose: np.ndarray, rounds: int = 6
 ) -> tuple[np.ndarray, float]:
     """A pose that fits better, by Gauss-Newton, and its misfit."""
     r = outline.residual(profile, pose)
-    best = misfit(outline, r)
+    best = crop_misfit(outline, r)
     for _ in range(rounds):
         slopes = pose_slopes(outline, profile, pose, r)
         step = -np.linalg.solve(
@@ -154,17 +156,19 @@ def adjusted_pose(
         )
         before = best
         for part in (1.0, 0.5, 0.25):
-            other = moved(pose, np.clip(part * step, -0.3, 0.3))
+            other = moved_pose(pose, np.clip(part * step, -0.3, 0.3))
             there = outline.residual(profile, other)
-            if misfit(outline, there) < best:
-                pose, r, best = other, there, misfit(outline, there)
+            if crop_misfit(outline, there) < best:
+                pose, r, best = other, there, crop_misfit(outline, there)
                 break
         if before - best < 0.005 * before:
             break
     return pose, best
 
 
-def adjusted(outlines: list[Outline], body: Revolved, rounds: int, share: float = 1.0) -> Revolved:
+def fit_profile_and_poses(
+    outlines: list[CropOutline], body: Revolved, rounds: int, share: float = 1.0
+) -> Revolved:
     """Profile and poses that fit better, by Gauss-Newton on all views together; the profile is
     shaped by the `share` that fits best."""
     profile, poses, n = body.profile, body.poses, 2 + KNOTS
@@ -174,7 +178,7 @@ def adjusted(outlines: list[Outline], body: Revolved, rounds: int, share: float 
     bends[2:, 2:] = np.diff(np.eye(KNOTS), 2, axis=0).T @ np.diff(np.eye(KNOTS), 2, axis=0)
     bends *= SMOOTH * len(outlines)
     residuals = [o.residual(profile, pose) for o, pose in zip(outlines, poses, strict=True)]
-    misfits = np.array([misfit(o, r) for o, r in zip(outlines, residuals, strict=True)])
+    misfits = np.array([crop_misfit(o, r) for o, r in zip(outlines, residuals, strict=True)])
     for _ in range(rounds):
         normal, right, own = DAMPING * len(outlines) * np.eye(n) + bends, bends @ profile, []
         for o, pose, r, shapes in zip(outlines, poses, residuals, use, strict=True):
@@ -195,11 +199,11 @@ def adjusted(outlines: list[Outline], body: Revolved, rounds: int, share: float 
         for part in (1.0, 0.5, 0.25):
             shape = profile + part * step
             there = [
-                moved(p, np.clip(-part * (inverse @ (down + cross.T @ step)), -0.3, 0.3))
+                moved_pose(p, np.clip(-part * (inverse @ (down + cross.T @ step)), -0.3, 0.3))
                 for p, (inverse, cross, down) in zip(poses, own, strict=True)
             ]
             others = [o.residual(shape, pose) for o, pose in zip(outlines, there, strict=True)]
-            levels = np.array([misfit(o, r) for o, r in zip(outlines, others, strict=True)])
+            levels = np.array([crop_misfit(o, r) for o, r in zip(outlines, others, strict=True)])
             if levels[use].sum() < before:
                 profile, poses, residuals, misfits = shape, np.array(there), others, levels
                 break
@@ -209,7 +213,7 @@ def adjusted(outlines: list[Outline], body: Revolved, rounds: int, share: float 
 
 
 def sought(
-    outlines: list[Outline], rings: Rings, body: Revolved, keep: int = 5
+    outlines: list[CropOutline], rings: Rings, body: Revolved, keep: int = 5
 ) -> list[list[tuple[np.ndarray, float]]]:
     """(pose, misfit) of each view, best first: what a search under all tilts finds, adjusted, what
     leans back, and the pose it has."""
@@ -231,7 +235,7 @@ def sought(
 
 
 def fit_revolution(
-    views: list[View], crops: list[Crop], least: float = 0.0, most: float = np.inf
+    views: list[InstanceView], crops: list[Crop], least: float = 0.0, most: float = np.inf
 ) -> Revolved | None:
     """One profile and a pose for each view that explain all silhouettes; None where no silhouette
     can be revolved.
@@ -241,7 +245,7 @@ def fit_revolution(
     """
     rings, outlines, distance = (
         crop_rings(crops, OUTLINE),
-        [outline_of(c) for c in crops],
+        [crop_outline(c) for c in crops],
         frame_scale(views),
     )
     first = []
@@ -265,35 +269,38 @@ def fit_revolution(
         if taken[k] < EACH and taken.total() < STARTS:
             taken[k] += 1
             poses = search(crops, gallery, keep=1, rings=rings).poses[:, 0]
-            bodies.append(adjusted(outlines, Revolved(profile, poses, np.zeros(len(views))), 3))
+            bodies.append(
+                fit_profile_and_poses(outlines, Revolved(profile, poses, np.zeros(len(views))), 3)
+            )
     if min(one.misfit for one in bodies) >= most:
         return None
     lasts = [
-        fitted(outlines, rings, body) for body in sorted(bodies, key=lambda one: one.misfit)[:LAST]
+        refine_revolution(outlines, rings, body)
+        for body in sorted(bodies, key=lambda one: one.misfit)[:LAST]
     ]
     best = min(lasts, key=lambda one: one.misfit)
     return min(
         best,
-        fitted(outlines, rings, leaning_the_other_way(outlines, best)),
+        refine_revolution(outlines, rings, leaning_the_other_way(outlines, best)),
         key=lambda one: one.misfit,
     )
 
 
-def fitted(outlines: list[Outline], rings: Rings, body: Revolved) -> Revolved:
+def refine_revolution(outlines: list[CropOutline], rings: Rings, body: Revolved) -> Revolved:
     """The body after rounds of Gauss-Newton, and a search for better poses after each; more views
     shape the profile each time."""
     for share in TRIMMED:
-        body = adjusted(outlines, body, 6, share)
+        body = fit_profile_and_poses(outlines, body, 6, share)
         tops = [one[0] for one in sought(outlines, rings, body)]
         body = Revolved(
             body.profile,
             np.array([pose for pose, _ in tops]),
             np.array([level for _, level in tops]),
         )
-    return adjusted(outlines, body, 8)
+    return fit_profile_and_poses(outlines, body, 8)
 
 
-def leaning_the_other_way(outlines: list[Outline], body: Revolved) -> Revolved:
+def leaning_the_other_way(outlines: list[CropOutline], body: Revolved) -> Revolved:
     """The body with all axes mirrored in the picture plane. From afar all outlines together are the
     same so (Necker's cube), and a fit
     that began there stays there: perspective tells which is right, once both are fitted."""
@@ -305,27 +312,27 @@ def leaning_the_other_way(outlines: list[Outline], body: Revolved) -> Revolved:
         body.profile, np.array([pose for pose, _ in tops]), np.array([level for _, level in tops])
     )
     for share in TRIMMED[1:]:
-        other = adjusted(outlines, other, 8, share)
+        other = fit_profile_and_poses(outlines, other, 8, share)
     return other
 
 
 def seats_of(crops: list[Crop], body: Revolved, most: int = 8) -> list[list[np.ndarray]]:
     """Poses (4, 4) of each view that fit it about as well as the best one, best first, with axes
     APART from each other."""
-    outlines, out = [outline_of(c) for c in crops], []
+    outlines, out = [crop_outline(c) for c in crops], []
     for tried in sought(outlines, crop_rings(crops, OUTLINE), body, keep=6):
         level, kept = AS_WELL[0] * tried[0][1] + AS_WELL[1], []
         for pose, height in tried:
             if (
                 height <= level
                 and len(kept) < most
-                and all(turned(pose, other) >= APART for other in kept)
+                and all(axis_angle_between(pose, other) >= APART for other in kept)
             ):
                 kept.append(pose)
         out.append(kept)
     return out
 
 
-def turned(a: np.ndarray, b: np.ndarray) -> float:
+def axis_angle_between(a: np.ndarray, b: np.ndarray) -> float:
     """Degrees between the axes of two poses."""
     return rotation_angle(rotation_from(axis_of(a), axis_of(b)))

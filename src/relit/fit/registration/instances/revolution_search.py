@@ -21,7 +21,7 @@ from relit.fit.registration.instances.regrowth import Placed
 from relit.fit.registration.instances.revolution_fit import fit_revolution, seats_of
 from relit.fit.registration.instances.rounds import model_of_all
 from relit.fit.registration.instances.unrolled import turned_by_decoration
-from relit.fit.registration.instances.views import View, albedo_render, carved, fit_model
+from relit.fit.registration.instances.views import InstanceView, albedo_render, carved, fit_model
 from relit.fit.registration.register import Crop, crop_rings, refine
 from relit.geometry.hull import NoShape
 
@@ -71,7 +71,7 @@ class RevolvedPlaces:
 
 
 def place_revolved(
-    views: list[View], crops: list[Crop], o: Search, *, seed: int = 0, say=lambda text: None
+    views: list[InstanceView], crops: list[Crop], o: Search, *, seed: int = 0, say=lambda text: None
 ) -> RevolvedPlaces | None:
     """Where bodies of revolution stand, and which are not sure of their turn about the axis; None
     where the objects are none, or their silhouettes do not tell the axis."""
@@ -88,7 +88,7 @@ def place_revolved(
     beside = turned_by_outline(views, body.profile, np.array([some[0] for some in seats]))
     if beside is not None:
         answers["what sticks out"] = beside
-    told = likeliest(
+    told = most_likely_set(
         views, crops, {name: answer.poses for name, answer in answers.items()}, o, seed
     )
     if told is None:
@@ -106,14 +106,14 @@ def place_revolved(
         tuple(np.flatnonzero(~sure).tolist()),
         DETAILED,
     )
-    return RevolvedPlaces(placed, exact, mostly_sure(placed) or (exact and flat(poses)))
+    return RevolvedPlaces(placed, exact, mostly_sure(placed) or (exact and lies_on_plane(poses)))
 
 
 def mostly_sure(placed: Placed) -> bool:
     return len(placed.firm) >= max(FEWEST, len(placed.own) / 2)
 
 
-def flat(poses: np.ndarray) -> bool:
+def lies_on_plane(poses: np.ndarray) -> bool:
     """Whether the middles of LAID objects or more lie on one plane."""
     middles = np.array([-p[:3, :3].T @ p[:3, 3] for p in poses])
     return len(poses) >= LAID and np.linalg.svd(middles - middles.mean(0))[1][2] <= FLAT * np.sqrt(
@@ -121,7 +121,9 @@ def flat(poses: np.ndarray) -> bool:
     )
 
 
-def likeliest(views, crops, answers: dict[str, np.ndarray], o: Search, seed: int) -> str | None:
+def most_likely_set(
+    views, crops, answers: dict[str, np.ndarray], o: Search, seed: int
+) -> str | None:
     """Which of several sets of poses (N, 4, 4) agrees best with a model of all of it; None where
     none does at all. Where others come close,
     longer fits decide: wrong turns make the model of all better for a while as well."""

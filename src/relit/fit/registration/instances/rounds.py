@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from relit.fit.registration.instances.growth import ANOTHER, grow
+from relit.fit.registration.instances.growth import ANOTHER, grow_instances
 from relit.fit.registration.instances.lookup import look_for
 from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.views import (
-    View,
+    InstanceView,
     albedo_render,
     carved,
-    crops_of,
     eyes_at,
     fit_model,
+    instance_crops,
     taut_body,
 )
 from relit.fit.registration.register import (
@@ -43,7 +43,7 @@ STILL = 0.5  # degrees; descents that turn instances by less have arrived
 SLACK = 0.005  # of the mean agreement by which two fits of the same poses may differ
 
 
-def settle(
+def settle_instances(
     views,
     crops,
     rings,
@@ -96,7 +96,7 @@ def settle(
     return poses, scores
 
 
-def descend(
+def refine_jointly(
     views,
     crops,
     rings,
@@ -138,7 +138,7 @@ def descend(
     return poses, scores
 
 
-def settled(
+def refine_and_verify(
     views,
     crops,
     rings,
@@ -154,10 +154,10 @@ def settled(
     kept where all agree no worse for it.
     torn: indices of those who agree better elsewhere with the model of the others, while all agree
     less for it."""
-    poses, scores = settle(
+    poses, scores = settle_instances(
         views, crops, rings, poses, scores, o, o.rounds, seed=seed + 10, parts=parts, say=say
     )
-    poses, scores = descend(
+    poses, scores = refine_jointly(
         views, crops, rings, poses, scores, o, seed=seed + 20, parts=parts, say=say
     )
     poses, scores = regrown(
@@ -184,7 +184,7 @@ def settled(
         )
         if not moved:
             break
-        again, level = descend(
+        again, level = refine_jointly(
             views, crops, rings, sent.copy(), scores, o, seed=seed + 40 + turn, parts=parts, say=say
         )
         better = agreement_of(views, again, o, seed)
@@ -203,7 +203,7 @@ def settled(
         o.late if late else 0
     ):  # those that came late have had the fewest descents, and hold the others back
         before = poses.copy()
-        poses, scores = descend(
+        poses, scores = refine_jointly(
             views, crops, rings, poses, scores, o, seed=seed + 50 + turn, parts=parts, say=say
         )
         if (
@@ -324,7 +324,7 @@ def regrown(
                 [crops[k] for k in rest],
                 chosen_rings(rings, rest),
             )
-            again[rest], _ = descend(
+            again[rest], _ = refine_jointly(
                 some,
                 theirs,
                 own_rings,
@@ -334,10 +334,10 @@ def regrown(
                 seed=seed + turn,
                 parts=parts,
             )
-            back = grow(
+            back = grow_instances(
                 views, crops, detail, DETAILED, rest, again, o.growth, seed=seed + 10 + turn
             )
-            again, level = descend(
+            again, level = refine_jointly(
                 views, crops, rings, back.poses, back.scores, o, seed=seed + 20 + turn, parts=parts
             )
             better = model_of_all(views, again, o, seed=seed)[1]
@@ -353,12 +353,14 @@ def regrown(
     return poses, scores
 
 
-def ambiguous(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0) -> np.ndarray:
+def ambiguous(
+    views: list[InstanceView], poses: np.ndarray, o: Search, *, seed: int = 0
+) -> np.ndarray:
     """(N,) degrees by which another pose of an instance that the pictures hardly tell from its own
     is turned against it, 0 where there is
     none: it agrees with the model of all so well that what the own one falls short of 1 grows by
     less than the share UNSURE."""
-    parts, crops = DETAILED, crops_of(views)
+    parts, crops = DETAILED, instance_crops(views)
     rings = crop_rings(crops, parts)
     render, own = model_of_all(views, poses, o, seed=seed)
     far = eyes_at(poses)
@@ -377,9 +379,9 @@ def ambiguous(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0)
     return angle
 
 
-def model_of_all(views: list[View], poses: np.ndarray, o: Search, *, seed: int = 0):
+def model_of_all(views: list[InstanceView], poses: np.ndarray, o: Search, *, seed: int = 0):
     """What renders a model that is fitted to all views, and the scores (N,) of all against it."""
-    crops = crops_of(views)
+    crops = instance_crops(views)
     values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
     model, _ = fit_model(views, poses, values, 2 * o.steps, seed=seed)
     render = albedo_render(model)

@@ -26,9 +26,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relit.fit.registration.instances.growth import grow
+from relit.fit.registration.instances.growth import grow_instances
 from relit.fit.registration.instances.guesses import Guesses, first_pairs, pair_guesses
-from relit.fit.registration.instances.links import borne_out, linked_sets
+from relit.fit.registration.instances.links import linked_sets, verified_links
 from relit.fit.registration.instances.lookahead import Branch, branch_values
 from relit.fit.registration.instances.mirror_plane import flipped_views
 from relit.fit.registration.instances.near_symmetry_search import coherent_turns, stands
@@ -39,17 +39,17 @@ from relit.fit.registration.instances.regrowth import (
     believed,
     confirmed,
     improved,
-    judged,
     mostly_firm,
+    score_growth,
 )
 from relit.fit.registration.instances.revolution_search import mostly_sure, place_revolved
-from relit.fit.registration.instances.rounds import descend, settled
+from relit.fit.registration.instances.rounds import refine_and_verify, refine_jointly
 from relit.fit.registration.instances.views import (
-    View,
+    InstanceView,
     best_seen,
-    crops_of,
     first_pose,
     frame_scale,
+    instance_crops,
 )
 from relit.fit.registration.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
@@ -67,7 +67,7 @@ LEFT_OUT = -2.0
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances,
     LEFT_OUT where the turn about the axis is not told. sure: nearly all of them were sure of their
     places and agree about as well as the others (`instance_regrowth.believed`), or another search
@@ -99,7 +99,7 @@ def first_starts(
         poses[pair] = guesses.poses[s, pair, 0]
         guessed.append((pair, poses))
     told = [
-        borne_out(views, crops, rings, parts, one, links, o.growth, seed)
+        verified_links(views, crops, rings, parts, one, links, o.growth, seed)
         for one in linked_sets(views, links, distance)[: o.pairs]
     ]
     value = branch_values(
@@ -113,7 +113,7 @@ def first_starts(
     return [[*guessed, *told][b] for b in order]
 
 
-def by_axes(revolved: Placed, say) -> Found:
+def by_axes(revolved: Placed, say) -> SearchResult:
     """Bodies of revolution as outlines and decoration have them: a search over all poses would lose
     the axes. Where most are sure of their turn the others are left out, to be sought in the
     finished model of these."""
@@ -127,26 +127,26 @@ def by_axes(revolved: Placed, say) -> Found:
         say(
             f"note: {len(unsure)} of {len(scores)} are not sure of their turn about the axis: their decoration may be mixed"
         )
-    return Found(revolved.poses, scores, True)
+    return SearchResult(revolved.poses, scores, True)
 
 
 def place(
-    views: list[View],
+    views: list[InstanceView],
     o: Search,
     *,
     seed: int = 0,
     links=(),
     say=lambda text: None,
     step=lambda done, total: None,
-) -> Found:
+) -> SearchResult:
     """Where all views stand, from nothing but the photo and its labels.
 
     links: ((i, j, rotation of i onto j in the photo), ...) from matching: growth tries them beside
     its own guesses. Raises NoShape where no set of poses agrees with the silhouettes.
     """
     if len(views) == 1:
-        return Found(first_pose(views[0], frame_scale(views))[None], np.ones(1), True)
-    crops = crops_of(views)
+        return SearchResult(first_pose(views[0], frame_scale(views))[None], np.ones(1), True)
+    crops = instance_crops(views)
     best: Placed | None = None
     revolved = place_revolved(views, crops, o, seed=seed, say=say)
     if revolved is not None and revolved.certain and mostly_sure(revolved.placed):
@@ -182,7 +182,7 @@ def place(
         doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
         say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
     rings = crop_rings(crops, best.parts)
-    poses, scores, torn = settled(
+    poses, scores, torn = refine_and_verify(
         views, crops, rings, best.poses, best.own, o, seed=seed, parts=best.parts, say=say
     )
     turned = (
@@ -191,7 +191,7 @@ def place(
         else None
     )
     if turned is not None:
-        poses, scores = descend(
+        poses, scores = refine_jointly(
             views,
             crops,
             rings,
@@ -202,10 +202,10 @@ def place(
             parts=best.parts,
             say=say,
         )
-    return Found(poses, without_torn(views, scores, torn, say), believed(best, o))
+    return SearchResult(poses, without_torn(views, scores, torn, say), believed(best, o))
 
 
-def without_torn(views: list[View], scores: np.ndarray, torn: set[int], say) -> np.ndarray:
+def without_torn(views: list[InstanceView], scores: np.ndarray, torn: set[int], say) -> np.ndarray:
     """The scores (N,), TORN of those who agree better elsewhere with the others while all agree
     less for it (`settled`): one in a wrong place has bent the others towards itself. Where these
     few can be spared, their place is for the finished model of the others to say."""
@@ -235,7 +235,7 @@ def up_to_turns(
 
 
 def grown_from_pairs(
-    views: list[View],
+    views: list[InstanceView],
     crops,
     best: Placed | None,
     o: Search,
@@ -261,7 +261,7 @@ def grown_from_pairs(
                 continue
             start, poses = starts[parts][turn]
             try:
-                grown = grow(
+                grown = grow_instances(
                     views,
                     crops,
                     rings[parts],
@@ -274,7 +274,7 @@ def grown_from_pairs(
                 )
             except NoShape:  # the silhouettes have nothing in common
                 continue
-            placed = judged(views, grown, parts, o, seed)
+            placed = score_growth(views, grown, parts, o, seed)
             if placed is None:
                 continue
             placed = confirmed(views, crops, rings[parts], placed, o, seed=seed, links=links)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from relit.fit.registration.instances.views import View, nearest_pixels
+from relit.fit.registration.instances.views import InstanceView, nearest_pixels
 from relit.geometry.sdf import node_positions
 
 NODES, FINE = 64, 96  # a side; of poses that are exact
@@ -31,7 +31,7 @@ class Silhouettes:
     leaves it as it is."""
 
     def __init__(
-        self, views: list[View], poses: np.ndarray, motions: np.ndarray, nodes: int = NODES
+        self, views: list[InstanceView], poses: np.ndarray, motions: np.ndarray, nodes: int = NODES
     ):
         p = node_positions(nodes).reshape(-1, 3)
         p = p[(p**2).sum(1) < 0.98]
@@ -109,7 +109,7 @@ class Silhouettes:
         return min((self.descended(s) for s in starts), key=lambda one: one[0])
 
 
-def closing(view: View, distance: float, nodes: int) -> np.ndarray:
+def closing(view: InstanceView, distance: float, nodes: int) -> np.ndarray:
     """What closes the pixels between the nodes of a grid of so many a side, seen from that
     distance."""
     apart = int(np.ceil(2 / (nodes - 1) * view.camera.fx / distance))

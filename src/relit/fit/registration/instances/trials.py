@@ -14,7 +14,7 @@ import numpy as np
 from relit.fit.registration.instances.options import Search
 from relit.fit.registration.instances.rounds import model_of_all
 from relit.fit.registration.instances.search import place
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import turns_apart
 
@@ -23,7 +23,7 @@ SAME = 15.0  # degrees within which two searches have put all objects alike
 
 
 def place_few(
-    views: list[View], o: Search, *, seed: int = 0, links=(), say=lambda text: None
+    views: list[InstanceView], o: Search, *, seed: int = 0, links=(), say=lambda text: None
 ) -> tuple[np.ndarray, np.ndarray]:
     """`place`, for few objects up to `o.searches` times: poses (N, 4, 4) and scores (N,). Raises
     NoShape where every search does."""

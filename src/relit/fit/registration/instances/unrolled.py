@@ -18,16 +18,16 @@ import cv2
 import numpy as np
 
 from relit.fit.registration.instances.azimuth_maps import (
+    AzimuthEstimate,
     Cells,
     Evidence,
-    Told,
     best_laid,
     cells_read,
     leads_of,
     turned_about,
 )
 from relit.fit.registration.instances.revolution import radius_at
-from relit.fit.registration.instances.views import View
+from relit.fit.registration.instances.views import InstanceView
 from relit.scene import Camera
 
 TURNS, LATITUDES = 120, 48  # cells of a map
@@ -105,7 +105,7 @@ def normals_at(profile: np.ndarray, p: np.ndarray, step: float = 0.03) -> np.nda
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-def channels_of(view: View) -> np.ndarray:
+def local_channels(view: InstanceView) -> np.ndarray:
     """(H, W, 3) of CHANNELS, against their surroundings on the object."""
     inside = ((view.mask > 0.5) & (view.known > 0.5)).astype(np.float32)
     tint = view.rgb[inside > 0].mean(0)
@@ -120,7 +120,7 @@ def channels_of(view: View) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Pixels:
+class UnrolledPixels:
     """row, column: (P,) cells of the map. band, facing: (P,) bins of latitude and of the normal in
     the photo's axes. values: (P, 3)."""
 
@@ -131,7 +131,7 @@ class Pixels:
     values: np.ndarray
 
 
-def unrolled(view: View, profile: np.ndarray, pose: np.ndarray) -> Pixels:
+def unrolled(view: InstanceView, profile: np.ndarray, pose: np.ndarray) -> UnrolledPixels:
     """The pixels of a view that show the body, on its map."""
     known = ((view.mask > 0.5) & (view.known > 0.5)).astype(np.uint8)
     rows, columns, p = hits(
@@ -146,16 +146,16 @@ def unrolled(view: View, profile: np.ndarray, pose: np.ndarray) -> Pixels:
     facing = np.clip((normal[:, :2] + 1) / 2 * NORMALS, 0, NORMALS - 1).astype(int) @ np.array(
         [NORMALS, 1]
     )
-    return Pixels(
+    return UnrolledPixels(
         np.clip((latitude * LATITUDES).astype(int), 0, LATITUDES - 1),
         (turn * TURNS).astype(int) % TURNS,
         np.clip((latitude * BANDS).astype(int), 0, BANDS - 1),
         facing,
-        channels_of(view)[rows[keep], columns[keep]],
+        local_channels(view)[rows[keep], columns[keep]],
     )
 
 
-def without_shading(pixels: list[list[Pixels]]) -> list[list[np.ndarray]]:
+def without_shading(pixels: list[list[UnrolledPixels]]) -> list[list[np.ndarray]]:
     """The values (P, 3) of each view in each seat, less the mean of their latitude, and less what
     all show where they face alike: they lie under one light."""
     firsts = [seats[0] for seats in pixels]
@@ -186,7 +186,7 @@ def without_shading(pixels: list[list[Pixels]]) -> list[list[np.ndarray]]:
     ]
 
 
-def map_of(one: Pixels, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def map_of(one: UnrolledPixels, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(LATITUDES, TURNS) bool, cells that are seen, and their mean values (3, LATITUDES, TURNS)."""
     count, total = (
         np.zeros((LATITUDES, TURNS), np.float32),
@@ -204,7 +204,7 @@ def map_of(one: Pixels, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def maps_of(
-    views: list[View], profile: np.ndarray, seats: list[list[np.ndarray]]
+    views: list[InstanceView], profile: np.ndarray, seats: list[list[np.ndarray]]
 ) -> list[list[tuple[np.ndarray, np.ndarray]]]:
     """`map_of` of each view in each seat, the values in standard deviations."""
     pixels = [
@@ -227,7 +227,7 @@ def maps_of(
 # ---------------------------------------------------------------- shifts
 
 
-def cells_of(shown: np.ndarray, values: np.ndarray) -> Cells:
+def pattern_cells(shown: np.ndarray, values: np.ndarray) -> Cells:
     """values: (C, LATITUDES, TURNS) of the channels that are asked, which lie below one another."""
     row, column = np.nonzero(shown)
     weight = np.cos((row + 0.5) / LATITUDES * np.pi - np.pi / 2)
@@ -265,8 +265,8 @@ ONE_VALUE = Evidence(lambda v: np.stack([np.ones_like(v), v, v**2]), gains_of_on
 
 
 def turned_by_decoration(
-    views: list[View], profile: np.ndarray, seats: list[list[np.ndarray]]
-) -> dict[str, Told]:
+    views: list[InstanceView], profile: np.ndarray, seats: list[list[np.ndarray]]
+) -> dict[str, AzimuthEstimate]:
     """The seat and the turn about the axis of each view, as each of CHANNELS tells it, and all
     together."""
     maps, out = maps_of(views, profile, seats), {}
@@ -276,7 +276,7 @@ def turned_by_decoration(
         ("colour and brightness", [0, 1, 2]),
     ):
         shape = len(use) * LATITUDES, TURNS
-        read = [[cells_of(shown, values[use]) for shown, values in one] for one in maps]
+        read = [[pattern_cells(shown, values[use]) for shown, values in one] for one in maps]
         _, chosen, turns = best_laid(read, group, ONE_VALUE, shape)
         poses = np.array(
             [
@@ -285,7 +285,7 @@ def turned_by_decoration(
             ]
         )
         size = [max(len(some[i].values), 1) for some, i in zip(read, chosen, strict=True)]
-        out[channel] = Told(
+        out[channel] = AzimuthEstimate(
             poses, leads_of(read, chosen, turns, ONE_VALUE, shape, APART) >= CLEAR * np.array(size)
         )
     return out

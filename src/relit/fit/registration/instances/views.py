@@ -43,7 +43,7 @@ OBJECT_RADIUS = 0.8  # of the widest silhouette, in the unit frame
 
 
 @dataclass(frozen=True)
-class View:
+class InstanceView:
     """One instance in its window of the photo. camera: of the window, its pose that of the photo.
     rgb: (h, w, 3) linear. mask: (h, w).
     known: (h, w), 0 where another object hides or may hide it. seen: share of the outline that ends
@@ -73,7 +73,7 @@ def views_of(
     side: int,
     normal: np.ndarray | None = None,
     photo: int = 0,
-) -> list[View]:
+) -> list[InstanceView]:
     """A view of each label > 0, in windows of at most `side` pixels. camera: of the photo, identity
     pose. normal: of the photo, or None.
     photo: its number. What a window holds beyond the photo's border is not known."""
@@ -107,18 +107,18 @@ def views_of(
             prior = None if prior is None else cv2.resize(prior, size, interpolation=cv2.INTER_AREA)
             c = c.resized(*size)
         out.append(
-            View(
+            InstanceView(
                 int(label), c, picture, mask, (known > 0.99).astype(np.float32), seen, prior, photo
             )
         )
     return out
 
 
-def crops_of(views: list[View]) -> list[Crop]:
+def instance_crops(views: list[InstanceView]) -> list[Crop]:
     return [crop_photo(v.rgb, v.mask, v.camera.with_pose(np.eye(4)), v.known) for v in views]
 
 
-def best_seen(views: list[View]) -> list[int]:
+def best_seen(views: list[InstanceView]) -> list[int]:
     """Indices of the views, those first whose outline ends at known background and which are
     large."""
     return sorted(
@@ -134,7 +134,7 @@ def window(a: np.ndarray, top: int, left: int, h: int, w: int) -> np.ndarray:
     return np.pad(a[slice(*rows), slice(*columns)], (*beyond, *[(0, 0)] * (a.ndim - 2)))
 
 
-def pixel_bank(views: list[View], poses: np.ndarray) -> PixelBank:
+def pixel_bank(views: list[InstanceView], poses: np.ndarray) -> PixelBank:
     """The pixels of the views, with the virtual cameras at `poses`; unknown ones are never
     drawn."""
     cameras = [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)]
@@ -149,7 +149,7 @@ def pixel_bank(views: list[View], poses: np.ndarray) -> PixelBank:
 # ---------------------------------------------------------------- the model
 
 
-def frame_scale(views: list[View]) -> float:
+def frame_scale(views: list[InstanceView]) -> float:
     """Distance (unit lengths) at which the widest silhouette has OBJECT_RADIUS: the scale of a
     photo is free, this fixes it."""
     widest = 0.0
@@ -170,7 +170,7 @@ def eyes_at(poses: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
 
 
-def first_pose(view: View, distance: float) -> np.ndarray:
+def first_pose(view: InstanceView, distance: float) -> np.ndarray:
     """object_from_camera (4, 4) of the instance that the model is grown from: the object's axes are
     the camera's, its middle lies on the ray through the middle of the silhouette."""
     y, x = np.nonzero(view.mask > 0.5)
@@ -193,8 +193,8 @@ def nearest_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
     return np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1), ok
 
 
-def inflated(
-    view: View, pose: np.ndarray, n: int, depth: float = 1.2, most: float = 0.55
+def inflate_silhouette(
+    view: InstanceView, pose: np.ndarray, n: int, depth: float = 1.2, most: float = 0.55
 ) -> np.ndarray:
     """Signed distance (n, n, n) of a body that fills the silhouette, as deep on both sides as
     `depth` times the distance to the outline."""
@@ -210,7 +210,7 @@ def inflated(
 
 
 def carved(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     n: int,
     tolerance: float,
@@ -253,7 +253,7 @@ def carved(
 
 
 def taut_body(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     n: int,
     tolerance: float,
@@ -270,7 +270,7 @@ def taut_body(
 
 
 def fit_model(
-    views: list[View],
+    views: list[InstanceView],
     poses: np.ndarray,
     values: np.ndarray,
     steps: int,
@@ -319,7 +319,7 @@ def hold_distances(model: VolumeModel) -> None:
     model.extra["correction_rates"] = mi.Float(rates.ravel())
 
 
-def moved_poses(bank: PixelBank, views: list[View], poses: np.ndarray) -> np.ndarray:
+def moved_poses(bank: PixelBank, views: list[InstanceView], poses: np.ndarray) -> np.ndarray:
     """The poses (N, 4, 4) with the corrections that a fit has found."""
     cameras = corrected(
         [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)],
@@ -334,7 +334,7 @@ def albedo_render(model: VolumeModel):
     return volume_render(replace(model, appearance=shade_albedo))
 
 
-def overlaps(render: Render, view: View, poses: np.ndarray) -> np.ndarray:
+def overlaps(render: Render, view: InstanceView, poses: np.ndarray) -> np.ndarray:
     """(K,) intersection over union of the view's silhouette and the model's at poses (K, 4, 4),
     where it is known."""
     h, w = view.mask.shape

@@ -13,7 +13,7 @@ from relit.scene import Camera
 ONE_SIDE = 75.0  # degrees between viewpoints below which silhouettes leave the depth open
 
 
-def inflated(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarray:
+def inflated_occupancy(crop: Crop, camera: Camera, nodes: int, loosen: float) -> np.ndarray:
     """(n, n, n) bool: where the object may be when one photo was seen from `camera`: as thick as
     its outline is far."""
     p = node_positions(nodes).reshape(-1, 3)
@@ -38,6 +38,6 @@ def depth_limit(crops: list[Crop], poses: np.ndarray, nodes: int) -> np.ndarray 
     spread = np.degrees(np.arccos(np.clip((centres @ centres[middle]).min(), -1, 1)))
     if spread >= ONE_SIDE:
         return None
-    return inflated(
+    return inflated_occupancy(
         crops[middle], crop_views([crops[middle]], poses[middle][None])[0], nodes, 1 + spread / 40
     )

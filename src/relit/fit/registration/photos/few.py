@@ -18,7 +18,7 @@ from relit.fit.passes.optimiser import NoStage
 from relit.fit.registration.photos.depth import depth_limit
 from relit.fit.registration.photos.poses import (
     Schedule,
-    descended,
+    fit_with_free_poses,
     gauge,
     polish,
     pose_towards,
@@ -36,12 +36,12 @@ BEHIND = 0.05
 Way = Callable[[], tuple[np.ndarray, np.ndarray]]
 
 
-def misfit(crops: list[Crop], poses: np.ndarray, seed: int) -> float:
+def photometric_misfit(crops: list[Crop], poses: np.ndarray, seed: int) -> float:
     """How badly one shape with one light per photo explains the photos, from these poses (P, 4, 4)
     on: the geometric mean of the volume pass's colour and mask losses, so that neither counts for
     its scale."""
     heard = NoStage()
-    descended(
+    fit_with_free_poses(
         crops,
         poses,
         NODES,
@@ -63,7 +63,7 @@ def best_way(
     for name, way in ways.items():
         try:
             poses, scores = way()
-            wrong = misfit(crops, poses, seed)
+            wrong = photometric_misfit(crops, poses, seed)
         except NoShape as error:
             say(f"{name}: {error}")
             failed = error

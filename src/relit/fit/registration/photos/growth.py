@@ -13,15 +13,15 @@ from dataclasses import replace
 import numpy as np
 
 from relit.conventions import similarity
-from relit.fit.registration.photos.depth import ONE_SIDE, depth_limit, inflated
+from relit.fit.registration.photos.depth import ONE_SIDE, depth_limit, inflated_occupancy
 from relit.fit.registration.photos.few import FEW, best_way, few_from_hints, polished
-from relit.fit.registration.photos.pairs import agreeing, pairs_of, placed_towards
+from relit.fit.registration.photos.pairs import largest_consistent_set, pairs_of, placed_towards
 from relit.fit.registration.photos.poses import (
     HOPELESS,
     Schedule,
     best_refined,
     coarse_model,
-    descended,
+    fit_with_free_poses,
     gauge,
     polish,
     pose_towards,
@@ -122,7 +122,9 @@ def grow_set(
         if i == 0:
             model = coarse_model(some, gauge(some, poses[used]), nodes, steps, 0.2, seed, limit)
         else:
-            model, moved = descended(some, poses[used], nodes, steps, seed + i, None, limit)
+            model, moved = fit_with_free_poses(
+                some, poses[used], nodes, steps, seed + i, None, limit
+            )
             poses[used] = gauge(some, moved)
             model = replace(model, appearance=shade_plain)
         render = volume_render(model)
@@ -155,7 +157,7 @@ def grow_set(
     return poses, scores
 
 
-def grow(
+def grow_photos(
     crops: list[Crop],
     first: int,
     sizes: list[int],
@@ -182,7 +184,9 @@ def grow(
         spread = np.degrees(np.arccos(np.clip((centres @ centres[used.index(first)]).min(), -1, 1)))
         camera = crop_views([crops[first]], anchor[None])[0]
         limit = (
-            inflated(crops[first], camera, nodes, 1 + spread / 40) if spread < ONE_SIDE else None
+            inflated_occupancy(crops[first], camera, nodes, 1 + spread / 40)
+            if spread < ONE_SIDE
+            else None
         )
         tolerance = 0.4 if len(used) < 5 else 0.2 if i < len(sizes) - 2 else 0.12
         model = coarse_model(
@@ -283,7 +287,11 @@ def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
     """Grow from a set that pairs hold together. Where it is too small grow from several photos for
     a few rounds, and go on with the one that agrees best, and settle with all photos."""
     rings, count = crop_rings(crops, PARTS), len(crops)
-    placed = agreeing(pairs_of(crops, rings, PARTS, seed), count) if count >= 2 * FEWEST else {}
+    placed = (
+        largest_consistent_set(pairs_of(crops, rings, PARTS, seed), count)
+        if count >= 2 * FEWEST
+        else {}
+    )
     if len(placed) >= FEWEST:
         say(f"pairs hold {len(placed)} of {count} photos together")
         poses = np.array([placed_towards(c, placed.get(k, np.eye(3))) for k, c in enumerate(crops)])
@@ -292,7 +300,7 @@ def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
     early = sorted({min(count, max(3, round(count * f))) for f in (0.07, 0.1, 0.14, 0.2)})
     tried = []
     for photo in first:
-        state = grow(crops, photo, early, seed, say, rings)
+        state = grow_photos(crops, photo, early, seed, say, rings)
         tried.append((float(np.mean(np.sort(state[1])[-early[-1] :])), photo))
     score, best = max(tried)
     if score < HOPELESS:
@@ -303,8 +311,8 @@ def poses_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say):
         min(count, max(3, round(count * f)))
         for f in (0.07, 0.1, 0.14, 0.2, 0.27, 0.37, 0.47, 0.57, 0.75, 1, 1, 1)
     ]
-    poses, scores = grow(crops, best, late, seed, say, rings)
-    return settle(crops, poses, scores, rings, keep, seed, say)
+    poses, scores = grow_photos(crops, best, late, seed, say, rings)
+    return settle_photos(crops, poses, scores, rings, keep, seed, say)
 
 
 def few_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say, cycles: int):
@@ -319,9 +327,9 @@ def few_by_growth(crops: list[Crop], starts: int, keep: int, seed: int, say, cyc
     )
 
     def grown_from(photo: int):
-        poses, _ = settle(
+        poses, _ = settle_photos(
             crops,
-            *grow(crops, photo, sizes, seed, say, rings, above=ABOVE),
+            *grow_photos(crops, photo, sizes, seed, say, rings, above=ABOVE),
             rings,
             keep,
             seed,
@@ -350,7 +358,7 @@ def start_photos(crops: list[Crop], rings, count: int) -> list[int]:
     return chosen
 
 
-def settle(
+def settle_photos(
     crops: list[Crop],
     poses: np.ndarray,
     scores: np.ndarray,

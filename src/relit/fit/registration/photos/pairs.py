@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relit.conventions import similarity
-from relit.fit.registration.photos.depth import inflated
+from relit.fit.registration.photos.depth import inflated_occupancy
 from relit.fit.registration.photos.poses import coarse_model, distance_for, pose_towards
 from relit.fit.registration.register import (
     AHEAD,
@@ -41,7 +41,7 @@ KEPT = 3  # hypotheses of each photo against each solid
 
 
 @dataclass(frozen=True)
-class Pair:
+class RelativePose:
     """rotation: (3, 3) axes of camera `first` from those of camera `second`. score: mean of both
     registrations."""
 
@@ -56,7 +56,7 @@ def angles(rotations: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((np.trace(rotations, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))
 
 
-def pairs_of(crops: list[Crop], rings, parts, seed: int, nodes: int = 40) -> list[Pair]:
+def pairs_of(crops: list[Crop], rings, parts, seed: int, nodes: int = 40) -> list[RelativePose]:
     """Pairs of photos that find each other in the same relation, best first. rings: of the crops,
     made with `parts`."""
     count = len(crops)
@@ -72,16 +72,22 @@ def pairs_of(crops: list[Crop], rings, parts, seed: int, nodes: int = 40) -> lis
         camera = crop_views([crops[i]], pose[None])[0]
         try:
             model = coarse_model(
-                [crops[i]], pose[None], nodes, 60, 0.4, seed, inflated(crops[i], camera, nodes, 1.0)
+                [crops[i]],
+                pose[None],
+                nodes,
+                60,
+                0.4,
+                seed,
+                inflated_occupancy(crops[i], camera, nodes, 1.0),
             )
         except NoShape:  # next to nothing is left of a thin silhouette
             continue
         found = search(crops, make_gallery(volume_render(model), views, parts), KEPT, rings=rings)
         scores[i], rotations[i] = found.scores, pose[:3, :3].T @ found.poses[..., :3, :3]
-    return mutual(scores, rotations)
+    return mutual_pairs(scores, rotations)
 
 
-def mutual(scores: np.ndarray, rotations: np.ndarray) -> list[Pair]:
+def mutual_pairs(scores: np.ndarray, rotations: np.ndarray) -> list[RelativePose]:
     """scores: (P, P, K), rotations: (P, P, K, 3, 3), of photo j in the solid of photo i. The pairs
     whose two registrations say the same."""
     out = []
@@ -96,11 +102,13 @@ def mutual(scores: np.ndarray, rotations: np.ndarray) -> list[Pair]:
             )
             k, m = np.unravel_index(both.argmax(), both.shape)
             if both[k, m] > 0:
-                out.append(Pair(float(both[k, m]), i, j, nearest_rotation(there[k] + back[m].T)))
+                out.append(
+                    RelativePose(float(both[k, m]), i, j, nearest_rotation(there[k] + back[m].T))
+                )
     return sorted(out, key=lambda pair: -pair.score)
 
 
-def agreeing(pairs: list[Pair], count: int) -> dict[int, np.ndarray]:
+def largest_consistent_set(pairs: list[RelativePose], count: int) -> dict[int, np.ndarray]:
     """The largest set of photos that the best pairs hold together: {photo: (3, 3) rotation, world
     from camera}. count: of all photos.
 
@@ -126,7 +134,7 @@ def agreeing(pairs: list[Pair], count: int) -> dict[int, np.ndarray]:
     return best
 
 
-def _holds(pair: Pair, placed: dict[int, np.ndarray]) -> bool:
+def _holds(pair: RelativePose, placed: dict[int, np.ndarray]) -> bool:
     if pair.first not in placed or pair.second not in placed:
         return False
     return bool(angles(placed[pair.first].T @ placed[pair.second] @ pair.rotation.T) < NEAR)

@@ -248,7 +248,7 @@ def best_refined(crops, found, render, rings, keep: int, steps=REFINE, parts=PAR
     return best, score
 
 
-def descended(
+def fit_with_free_poses(
     crops: list[Crop],
     poses: np.ndarray,
     nodes: int,
@@ -319,7 +319,7 @@ def polish(
     hinted = np.linalg.norm(directions, axis=1) > 0.5
     for i in range(begun, cycles):
         limit = depth_limit(crops, gauge(crops, poses), 48) if limited else None
-        model, poses = descended(crops, poses, 48, 200, seed + 200 + i, held, limit)
+        model, poses = fit_with_free_poses(crops, poses, 48, 200, seed + 200 + i, held, limit)
         render = volume_render(replace(model, appearance=shade_plain))
         gallery = make_gallery(render, views_from(directions_around(500, seed + 200 + i)), PARTS)
         prior = 0.5 * HINT * hint_prior(gallery, directions, degrees, 45.0) * hinted[:, None, None]
@@ -339,7 +339,7 @@ def polish(
     return gauge(crops, poses), scores
 
 
-def agreement(
+def cross_validated_share(
     crops: list[Crop], poses: np.ndarray, seed: int, within=20.0, nodes=40, steps=90, views=400
 ) -> float:
     """Share of photos that a search without hints puts within so many degrees of their pose, in a
