@@ -309,12 +309,12 @@ def _unit_normals(normal: np.ndarray) -> np.ndarray:
 LOOKED_FOR = "photos in the folder itself or in images/, image/, rgb/, input/ or photos/"
 
 
-def photo_folder(path: Path) -> Path | None:
+def recognise(path: Path) -> Path | None:
     """The folder with the photos, or None."""
     return image_folder(path) if path.is_dir() else None
 
 
-def read_photos(path: Path, found: Path) -> Reading:
+def read(path: Path, found: Path) -> Reading:
     """All photos of a folder, without cameras. Of a camera that writes two files of every photo the
     developed one is taken."""
     files = list_images(found)
