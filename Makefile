@@ -29,6 +29,7 @@ test-quick: environment
 lint: environment
 	$(VENV)/bin/python -m ruff check .
 	$(VENV)/bin/python -m ruff format --check .
+	$(VENV)/bin/python -m pyright --pythonpath $(VENV)/bin/python
 
 format: environment
 	$(VENV)/bin/python -m ruff check --fix .

@@ -10,7 +10,7 @@ with contextlib.suppress(OSError):
     ctypes.CDLL("libz.so.1")
 
 __version__ = "0.1.0"
-__all__ = ["AssetFolder", "__version__", "inspect", "load", "open_capture", "reconstruct"]
+__all__ = ["AssetFolder", "__version__", "inspect", "load", "open_capture", "reconstruct"]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str):

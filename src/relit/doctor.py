@@ -138,7 +138,8 @@ def _wheels() -> Check:
         for r in wanted
         if "extra ==" not in r and "python_version" not in r
     ]
-    missing, versions = [], {}
+    missing: list[str] = []
+    versions: dict[str, str] = {}
     for name in names:
         try:
             versions[name] = importlib.metadata.version(name)

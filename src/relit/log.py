@@ -9,7 +9,7 @@ import resource
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
@@ -112,7 +112,7 @@ class Progress:
 
 
 @contextmanager
-def counted(title: str) -> Iterator[Callable[[int, int], None]]:
+def counted(title: str) -> Generator[Callable[[int, int], None], None, None]:
     """A progress line as a function of (done, total); the total may change."""
     progress = Progress(Log(), title, None)
 

@@ -45,4 +45,4 @@ class Recipe:
     finds_cameras: bool = False
     min_photos: int = 3
     object_cost: ObjectCost | None = None
-    ablations: Mapping[str, str] = field(default_factory=dict)
+    ablations: Mapping[str, str] = field(default_factory=dict[str, str])

@@ -295,12 +295,15 @@ def _video(out: Path, camera: Camera) -> Iterator[Callable]:
 def _encoder(path: Path, width: int, height: int) -> tuple[Callable, Callable]:
     """(function that takes an RGB uint8 picture, function that finishes the file)."""
     try:
-        import imageio_ffmpeg
+        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
     except ImportError:
         import cv2
 
         writer = cv2.VideoWriter(
-            str(path), cv2.VideoWriter_fourcc(*"mp4v"), FRAMES_PER_SECOND, (width, height)
+            str(path),
+            cv2.VideoWriter_fourcc(*"mp4v"),  # pyright: ignore[reportAttributeAccessIssue]
+            FRAMES_PER_SECOND,
+            (width, height),  # pyright: ignore[reportAttributeAccessIssue]
         )
         if not writer.isOpened():
             fix = "pip install 'relit[video]', or write pictures to a folder"

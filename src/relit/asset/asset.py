@@ -96,7 +96,7 @@ def cameras_from_json(data: dict, where: str | Path = "") -> tuple[tuple[str, Ca
             out.append(
                 (
                     str(f.get("file_path", f"{i:04d}")),
-                    Camera(width, height, *numbers, world_from_cv_camera(pose), tuple(k)),
+                    Camera(width, height, *numbers, world_from_cv_camera(pose), tuple(k)),  # pyright: ignore[reportCallIssue]
                 )
             )
     except (KeyError, TypeError, ValueError, OverflowError) as e:

@@ -217,7 +217,7 @@ def write_glb(
     mesh = replace(mesh, normals=(normals / length).astype(np.float32))
     attributes = {
         "POSITION": doc.accessor(mesh.vertices, bounds=True),
-        "NORMAL": doc.accessor(mesh.normals),
+        "NORMAL": doc.accessor(mesh.normals),  # pyright: ignore[reportArgumentType]
     }
     m: dict = {"name": name, "pbrMetallicRoughness": _pbr(doc, material)}
     if has_border(mesh):

@@ -271,7 +271,7 @@ def _material(file: _File, index: int | None) -> tuple[Material, int, dict]:
     ior = float(ext.get("KHR_materials_ior", {}).get("ior", 1.5))
     f = lambda a: None if a is None else np.ascontiguousarray(a, np.float32)  # noqa: E731
     return (
-        Material(f(base), f(rough), f(metal), ior, f(specular), f(normal)),
+        Material(f(base), f(rough), f(metal), ior, f(specular), f(normal)),  # pyright: ignore[reportArgumentType]
         texcoord,
         dict(transform),
     )

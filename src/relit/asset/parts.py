@@ -73,7 +73,7 @@ def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
     mesh = Mesh(
         np.concatenate([p.vertices for p in parts]).astype(np.float32),
         np.concatenate(faces).astype(np.int32),
-        np.concatenate([p.normals for p in parts]).astype(np.float32),
+        np.concatenate([p.normals for p in parts]).astype(np.float32),  # pyright: ignore[reportArgumentType, reportCallIssue]
         None if uvs is None else uvs.astype(np.float32),
     )
     if not (np.isfinite(mesh.vertices).all() and (uvs is None or np.isfinite(uvs).all())):
@@ -91,9 +91,9 @@ def merge_parts(parts: list[Part], path: Path) -> tuple[Mesh, Material]:
         raise UserError(
             "the model has a material value that is not a number", fix=f"export it again: {path}"
         )
-    lost = ~(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 0.01)
+    lost = ~(np.abs(np.linalg.norm(mesh.normals, axis=-1) - 1) < 0.01)  # pyright: ignore[reportArgumentType, reportCallIssue]
     if lost.any():  # zero normals in the file
-        mesh = replace(mesh, normals=np.where(lost[:, None], vertex_normals(mesh), mesh.normals))
+        mesh = replace(mesh, normals=np.where(lost[:, None], vertex_normals(mesh), mesh.normals))  # pyright: ignore[reportArgumentType, reportCallIssue]
     return mesh, material
 
 
@@ -168,9 +168,9 @@ def _atlas(parts: list[Part], keys: list, path: Path) -> tuple[list[Part], Mater
             np.abs(normal).sum(-1, keepdims=True) > 0.1, normal, np.array([0, 0, 1], np.float32)
         )
     merged = Material(
-        pack(lambda m: m.base_color, 3),
-        pack(lambda m: m.roughness, 1),
-        pack(lambda m: m.metallic, 1),
+        pack(lambda m: m.base_color, 3),  # pyright: ignore[reportArgumentType]
+        pack(lambda m: m.roughness, 1),  # pyright: ignore[reportArgumentType]
+        pack(lambda m: m.metallic, 1),  # pyright: ignore[reportArgumentType]
         iors.pop(),
         pack(lambda m: m.specular, 3),
         normal,

@@ -143,7 +143,7 @@ def _group(model) -> Group:
         numbers[order],
         np.array([c.world_from_camera for c in cameras]),
         focals,
-        sparse_points(model),
+        sparse_points(model),  # pyright: ignore[reportArgumentType]
         views,
     )
 

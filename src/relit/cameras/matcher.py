@@ -62,7 +62,7 @@ def load_matcher(setting: str) -> Matcher:
         sys.path.remove(here)
     if not callable(found):
         raise UserError(f"the matcher '{setting}' is no function", code=2)
-    return found
+    return found  # pyright: ignore[reportReturnType]
 
 
 def matcher_picture(rgb: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float]:

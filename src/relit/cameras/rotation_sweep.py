@@ -74,7 +74,7 @@ def find_features(
     level = np.where(inside, np.clip(grey / max(high, 1e-6), 0, 1) ** (1 / 2.2), 0.3)
     picture = cv2.resize((level * 255).astype(np.uint8), size, interpolation=cv2.INTER_CUBIC)
     solid = cv2.erode((cv2.resize(mask, size) > 0.5).astype(np.uint8), np.ones((7, 7)))
-    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.006, edgeThreshold=15)
+    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.006, edgeThreshold=15)  # pyright: ignore[reportAttributeAccessIssue]
     found = sift.detect(picture, solid * 255)
     # one keypoint a place and size: SIFT doubles those with several orientations, which do not
     # count here

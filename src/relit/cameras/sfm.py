@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -152,7 +153,7 @@ def find_cameras(
             if best.count >= ENOUGH * len(photos):
                 break
     seconds = time.monotonic() - began
-    reason = _reason(best, photos, names, features)
+    reason = _reason(best, photos, names, features)  # pyright: ignore[reportArgumentType]
     if best.count < max(LEAST, LEAST_SHARE * len(photos)):
         raise UserError(
             f"{'no' if best.count < LEAST else 'too few'} cameras were found: {best.count} of {len(photos)} photos registered",
@@ -216,7 +217,7 @@ def _plan(
 
 @dataclass
 class _Found:
-    model: object = None
+    model: Any = None
     count: int = 0
     models: int = 0
     error: float = float("inf")
@@ -362,7 +363,7 @@ def _matches(database: Path) -> dict[str, int]:
         names = {i.image_id: i.name for i in db.read_all_images()}
         best = dict.fromkeys(names.values(), 0)
         for pair, count in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
-            for i in pycolmap.pair_id_to_image_pair(int(pair)) if np.ndim(pair) == 0 else pair:
+            for i in pycolmap.pair_id_to_image_pair(int(pair)) if np.ndim(pair) == 0 else pair:  # pyright: ignore[reportGeneralTypeIssues]
                 best[names[int(i)]] = max(best[names[int(i)]], int(count))
     return best
 
@@ -424,7 +425,7 @@ class _Model:
     """What was found. strays: image names of `model` that are left out. points: (N, 3) on the
     object, or None."""
 
-    model: object
+    model: Any
     strays: tuple[str, ...]
     points: np.ndarray | None
 
@@ -440,7 +441,7 @@ def _strays(
     if any(masks[i.name] is None for i in images):
         return [], points
     cameras = [camera_from_colmap(i.camera, world_from_camera(i))[0] for i in images]
-    odd, agreed = stray_photos(cameras, [masks[i.name] for i in images], points)
+    odd, agreed = stray_photos(cameras, [masks[i.name] for i in images], points)  # pyright: ignore[reportArgumentType]
     return sorted(images[k].name for k in odd), None if points is None else points[agreed]
 
 

@@ -60,7 +60,7 @@ class Network:
         """(H, W, 3) float32 sRGB values in [0, 1], at the size that the network gets -> what it
         says. Raises UserError where it takes none of that size."""
         h, w = shown.shape[:2]
-        blob = ((shown - np.float32(MEAN)) / np.float32(SPREAD)).transpose(2, 0, 1)[None]
+        blob = ((shown - np.float32(MEAN)) / np.float32(SPREAD)).transpose(2, 0, 1)[None]  # pyright: ignore[reportArgumentType]
         try:
             self.net.setInput(np.ascontiguousarray(blob, np.float32))
             return np.asarray(self.net.forward())
@@ -136,6 +136,6 @@ def predicted_normals(network: Network, rgb: np.ndarray, labels: np.ndarray) -> 
         n = n * 2 - 1 if n.min() >= 0 else n
         n = cv2.resize(
             np.ascontiguousarray(n), mask.shape[1::-1], interpolation=cv2.INTER_LINEAR
-        ) * np.float32([1, -1, -1])
+        ) * np.float32([1, -1, -1])  # pyright: ignore[reportArgumentType]
         out[window] += n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6) * mask
     return out

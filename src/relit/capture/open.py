@@ -133,11 +133,14 @@ def open_capture(
             notes += ["the object sphere is the corrected one"] if sphere is not None else []
         if sphere is None:
             sphere, source = settled_sphere(
-                reading.sphere, reading.presumed, [views[i] for i in train], reading.points
+                reading.sphere,
+                reading.presumed,
+                [views[i] for i in train],  # pyright: ignore[reportArgumentType]
+                reading.points,  # pyright: ignore[reportArgumentType]
             )
             notes += [f"the object sphere was found from {source}"] if source else []
-        notes += check_sphere(sphere, cameras)
-        up = up_direction(cameras)
+        notes += check_sphere(sphere, cameras)  # pyright: ignore[reportArgumentType]
+        up = up_direction(cameras)  # pyright: ignore[reportArgumentType]
     capture = Capture(
         root=reading.root,
         format=reading.format,
@@ -168,7 +171,7 @@ def with_grabcut(capture: Capture) -> Capture:
     def cut(p: Photo) -> Photo:
         if _is_corrected(p):
             return p
-        return photo.with_mask(p, grabcut(p.load().rgb, p.camera, capture.sphere))
+        return photo.with_mask(p, grabcut(p.load().rgb, p.camera, capture.sphere))  # pyright: ignore[reportArgumentType]
 
     if capture.sphere is None or not capture.has_cameras:
         raise UserError(
@@ -311,7 +314,7 @@ def _small(p: Photo) -> Image:
 
 
 def _with(p: Photo, **changes) -> Photo:
-    return replace(p, load=replace(p.load, **changes))
+    return replace(p, load=replace(p.load, **changes))  # pyright: ignore[reportArgumentType]
 
 
 def _say_empty(empty: list[str], notes: list[str]) -> None:
@@ -362,7 +365,7 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
             f"add the masks, or use --masks none: {folder or reading.root}",
         )
     looked = [
-        (None, False) if f.held_out else _small_mask(m, p)
+        (None, False) if f.held_out else _small_mask(m, p)  # pyright: ignore[reportArgumentType]
         for f, m, p in zip(reading.frames, files, photos, strict=True)
     ]
     small = [mask for mask, _ in looked]

@@ -95,8 +95,8 @@ class Undistorted:
             return None if a is None else cv2.remap(a, x, y, flag, borderMode=cv2.BORDER_REPLICATE)
 
         clipped = None if pixels.clipped is None else warp(pixels.clipped.astype(np.float32)) > 0
-        normal = None if pixels.normal is None else _unit_normals(warp(pixels.normal))
-        return Pixels(warp(pixels.rgb), warp(pixels.mask), normal, clipped, white=pixels.white)
+        normal = None if pixels.normal is None else _unit_normals(warp(pixels.normal))  # pyright: ignore[reportArgumentType]
+        return Pixels(warp(pixels.rgb), warp(pixels.mask), normal, clipped, white=pixels.white)  # pyright: ignore[reportArgumentType]
 
     @property
     def mask(self) -> Any:
@@ -127,7 +127,7 @@ def layers(load: Callable[[], Pixels]) -> Iterator[Callable[[], Pixels]]:
     file."""
     while load is not None:
         yield load
-        load = getattr(load, "load", None)
+        load = getattr(load, "load", None)  # pyright: ignore[reportAssignmentType]
 
 
 def with_mask(photo: Photo, mask: np.ndarray) -> Photo:

@@ -32,7 +32,7 @@ class Verb:
     summary: str
     flags: Callable[[Parser], None]
     act: Callable[[argparse.Namespace], int | None]
-    kinds: Mapping[str, Kind] = field(default_factory=dict)
+    kinds: Mapping[str, Kind] = field(default_factory=dict[str, Kind])
 
     def kind_in(self, argv: Sequence[str]) -> str:
         """The kind named in argv: the first word that is a kind and does not follow a flag; otherwise
@@ -96,7 +96,7 @@ class Parser(argparse.ArgumentParser):
             f"relit {self.verb}: {what}", fix=f"relit {self.verb} --help", code=EXIT_USAGE
         )
 
-    def _check_value(self, action, value) -> None:
+    def _check_value(self, action: argparse.Action, value: object) -> None:
         if action.choices is not None and value not in action.choices:
             name = action.option_strings[-1] if action.option_strings else action.dest
             what = f"relit {self.verb}: {name} {value} is not known.{did_you_mean(str(value), action.choices)}"

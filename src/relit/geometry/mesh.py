@@ -32,7 +32,7 @@ def extract_mesh(values: np.ndarray, *, faces: int | None = None) -> Mesh:
     closed = values.copy()  # a surface that would leave the cube is capped just inside
     for axis in range(3):
         for side in (0, -1):
-            index = [slice(None)] * 3
+            index: list = [slice(None)] * 3
             index[axis] = side
             closed[tuple(index)] = np.maximum(closed[tuple(index)], h)
     if closed.min() >= 0:
@@ -56,7 +56,7 @@ def _without_floaters(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if len(parts) < 2:
         return mesh
     areas = np.array([p.area for p in parts])
-    return trimesh.util.concatenate(
+    return trimesh.util.concatenate(  # pyright: ignore[reportReturnType]
         [p for p, a in zip(parts, areas, strict=False) if a >= KEEP * areas.max()]
     )
 
@@ -75,7 +75,7 @@ def _decimate(mesh: trimesh.Trimesh, ratio: float) -> trimesh.Trimesh:
         options.num_threads = 2
         pycolmap.simplify_mesh(source, target, options)
         out = trimesh.load(target, process=False, force="mesh")
-    out = trimesh.Trimesh(out.vertices, out.faces, process=True)
+    out = trimesh.Trimesh(out.vertices, out.faces, process=True)  # pyright: ignore[reportAttributeAccessIssue]
     out.update_faces(out.nondegenerate_faces() & out.unique_faces())
     out.remove_unreferenced_vertices()
     return out

@@ -84,7 +84,7 @@ def redistance(values: np.ndarray) -> np.ndarray:
     of the sign.
     """
     h = 2.0 / (values.shape[0] - 1)
-    gradient = np.stack(np.gradient(values, h), -1)
+    gradient = np.stack(np.gradient(values, h), -1)  # pyright: ignore[reportArgumentType, reportCallIssue]
     near = values / np.maximum(np.linalg.norm(gradient, axis=-1), 0.2)
     inside = values < 0
     if not inside.any() or inside.all():

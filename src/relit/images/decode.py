@@ -55,7 +55,7 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
     apply the file's colour profile."""
     suffix = checked(path)
     if suffix == ".exr":
-        return _finite(exr(path)[0], path), True
+        return _finite(exr(path)[0], path), True  # pyright: ignore[reportArgumentType]
     if suffix == ".hdr":
         import cv2
 
@@ -105,8 +105,8 @@ def standard_colours(image: PilImage.Image) -> PilImage.Image:
         return image
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in (
-            source.profile.profile_description or ""
+        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in (  # pyright: ignore[reportAttributeAccessIssue]
+            source.profile.profile_description or ""  # pyright: ignore[reportAttributeAccessIssue]
         ):
             return image
         intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
@@ -118,7 +118,7 @@ def standard_colours(image: PilImage.Image) -> PilImage.Image:
         return image  # a broken profile is no reason to refuse the photo
     if image.mode == "RGBA":
         out.putalpha(image.getchannel("A"))
-    return out
+    return out  # pyright: ignore[reportReturnType]
 
 
 def _is_sixteen_bit(path: Path, suffix: str) -> bool:
@@ -250,7 +250,7 @@ def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
 def pil(path: Path):
     if path.suffix.lower() in HEIC:
         try:
-            from pillow_heif import register_heif_opener
+            from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise UserError(
                 "HEIC photos need an optional package",
@@ -295,7 +295,7 @@ def raw_file(path: Path):
 
 def rawpy():
     try:
-        import rawpy
+        import rawpy  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise UserError(
             "RAW photos need an optional package",

@@ -171,7 +171,7 @@ def read_header(path: str | Path) -> Header:
     suffix = checked(path)
     if suffix == ".exr":
         channels, shape = exr(path, header_only=True)
-        return Header(shape[1], shape[0], any(c.split(".")[-1] == "A" for c in channels))
+        return Header(shape[1], shape[0], any(c.split(".")[-1] == "A" for c in channels))  # pyright: ignore[reportAttributeAccessIssue]
     if suffix == ".hdr":
         w, h = hdr_size(path)
         return Header(w, h)

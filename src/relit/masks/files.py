@@ -117,7 +117,7 @@ def _of_palette(rgb: np.ndarray) -> np.ndarray:
     """(H, W) of (H, W, 3): every colour but black is an object, dark red too; grey levels as they
     are, unless none is bright."""
     soft = rgb.max() > 0.5 and (rgb == rgb[..., :1]).all()
-    return rgb[..., 0] if soft else rgb.any(axis=-1).astype(np.float32)
+    return rgb[..., 0] if soft else rgb.any(axis=-1).astype(np.float32)  # pyright: ignore[reportReturnType]
 
 
 def border_share(mask: np.ndarray) -> float:

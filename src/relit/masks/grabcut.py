@@ -89,10 +89,10 @@ def cut(small: np.ndarray, labels: np.ndarray, iterations: int) -> np.ndarray:
     if not ((labels == cv2.GC_PR_FGD).any() and (labels != cv2.GC_PR_FGD).any()):
         return np.zeros(labels.shape, np.uint8)
     cv2.setRNGSeed(0)  # the colour models start from k-means: same photo, same mask
-    cv2.grabCut(
+    cv2.grabCut(  # pyright: ignore[reportCallIssue]
         np.ascontiguousarray(small[..., ::-1]),
         labels,
-        None,
+        None,  # pyright: ignore[reportArgumentType]
         np.zeros((1, 65)),
         np.zeros((1, 65)),
         iterations,

@@ -12,7 +12,7 @@ def segmenter(model: str = "u2net"):
     """A function linear (H, W, 3) -> mask (H, W) float32 in [0, 1]. Raises UserError when the extra
     or its weights are not there."""
     try:
-        import rembg
+        import rembg  # pyright: ignore[reportMissingImports]
     except (
         ImportError,
         SystemExit,

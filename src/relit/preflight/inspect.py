@@ -117,12 +117,13 @@ def _of_light(kind: str, regime: dict) -> list[dict]:
 def write_plot(path: Path, capture: Capture) -> None:
     """Write an SVG file of the cameras around the object sphere, from above and from the side.
     Raises UserError when cameras or sphere are unknown."""
-    if not capture.has_cameras or capture.sphere is None:
+    drawing = cameras_svg(capture)
+    if drawing is None:
         what = "the cameras are unknown, so there is nothing to plot"
         raise UserError(
             what, "the reconstruction estimates them", "run relit reconstruct and open its report"
         )
-    write_text(path, cameras_svg(capture))
+    write_text(path, drawing)
 
 
 def cameras_svg(capture: Capture) -> str | None:
@@ -132,7 +133,7 @@ def cameras_svg(capture: Capture) -> str | None:
     from relit.report.curves import camera_plot
 
     plot = camera_plot(
-        [p.camera for p in capture.photos],
+        [p.camera for p in capture.photos],  # pyright: ignore[reportArgumentType]
         _upright(capture) @ np.linalg.inv(capture.sphere.world_from_unit),
     )
     return plot.replace(

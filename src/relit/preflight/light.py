@@ -61,7 +61,7 @@ def light_regime(capture: Capture, looks: list[Look] | None = None) -> dict:
     _limb(looks, votes, evidence)
     if capture.sphere is not None and len([x for x in looks if x.camera is not None]) >= 4:
         _shading(looks, capture.sphere, votes, evidence)
-    guess = max(votes, key=votes.get)
+    guess = max(votes, key=votes.__getitem__)
     others = max(v for k, v in votes.items() if k != guess)
     return {
         "guess": guess,
@@ -164,7 +164,8 @@ def shading_change(looks: list[Look]) -> float:
     if all(x.mask is not None for x in looks):
         inside = (
             np.mean(
-                [cv2.resize(x.mask, (96, 96), interpolation=cv2.INTER_AREA) for x in looks], axis=0
+                [cv2.resize(x.mask, (96, 96), interpolation=cv2.INTER_AREA) for x in looks],  # pyright: ignore[reportArgumentType, reportCallIssue]
+                axis=0,  # pyright: ignore[reportArgumentType, reportCallIssue]
             )
             > 0.9
         )

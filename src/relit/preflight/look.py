@@ -79,7 +79,7 @@ def look(capture: Capture, photo: Photo) -> Look:
     path = capture.folder / photo.name
     return Look(
         photo.name,
-        rgb,
+        rgb,  # pyright: ignore[reportArgumentType]
         mask,
         camera,
         sharpness(pixels.rgb, pixels.mask),

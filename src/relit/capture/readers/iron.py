@@ -41,7 +41,7 @@ def read(path: Path, found: Path) -> Reading:
     masked = all(f.mask is not None for f in frames if not f.held_out)
     notes = []
     sphere = None if masked else Sphere(np.zeros(3), 1.0)
-    if not masked and np.mean([_sees_origin(f.camera) for f in frames]) < IN_VIEW:
+    if not masked and np.mean([_sees_origin(f.camera) for f in frames]) < IN_VIEW:  # pyright: ignore[reportArgumentType]
         sphere = None
         notes.append("the object does not stand in the unit sphere: its sphere is found anew")
     return Reading(

@@ -142,7 +142,7 @@ def _quadrants(path: Path, names: list[str]) -> Hints:
                 why,
                 f"make it again with `relit quadrants`: {path}",
             )
-        said[Path(name).name] = direction_of(answers, name, path)
+        said[Path(name).name] = direction_of(answers, name, path)  # pyright: ignore[reportArgumentType]
     known = {Path(n).name: n for n in names}
     stems = {Path(n).stem: n for n in names}
     directions = {}

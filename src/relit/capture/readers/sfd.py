@@ -266,7 +266,7 @@ def labelled_photo(
             notes.append(
                 f"the focal length is not known; {focal:.0f} pixels are assumed (--focal PIXELS): shapes come out too flat or too deep"
             )
-    f = float(focal if focal is not None else known)
+    f = float(focal if focal is not None else known)  # pyright: ignore[reportArgumentType]
     scale = min(1.0, (max_side or max(w, h)) / max(w, h))
     size = (max(1, round(w * scale)), max(1, round(h * scale)))
     camera = Camera(w, h, f, f, *middle, pose).resized(*size)

@@ -216,7 +216,7 @@ def _camera(data: dict, pose: np.ndarray, file: Path, what: str, source: Path):
     k = [number(f"k{i}", 0.0) for i in range(1, 7)]
     distortion, lens = (), None
     if model in FISHEYE:
-        lens = FisheyeLens(tuple(k[:4]))
+        lens = FisheyeLens(tuple(k[:4]))  # pyright: ignore[reportArgumentType]
     elif model in OPENCV:
         full = (k[0], k[1], number("p1", 0.0), number("p2", 0.0), k[2], k[3], k[4], k[5])
         if model != "FULL_OPENCV" and (
@@ -230,6 +230,13 @@ def _camera(data: dict, pose: np.ndarray, file: Path, what: str, source: Path):
         last = max((i + 1 for i, v in enumerate(full) if v), default=0)
         distortion = full[: (0 if last == 0 else 4 if last <= 4 else 5 if last == 5 else 8)]
     camera = Camera(
-        round(w), round(h), fx, fy, number("cx", w / 2), number("cy", h / 2), pose, distortion
+        round(w),
+        round(h),
+        fx,
+        fy,
+        number("cx", w / 2),  # pyright: ignore[reportArgumentType]
+        number("cy", h / 2),  # pyright: ignore[reportArgumentType]
+        pose,
+        distortion,  # pyright: ignore[reportArgumentType]
     )
     return camera, lens

@@ -78,7 +78,7 @@ def network_file(setting: str) -> Path:
             f"'{setting}' names no file on the hub", fix="write hub:OWNER/NAME/PATH.onnx", code=2
         )
     try:
-        from huggingface_hub import hf_hub_download
+        from huggingface_hub import hf_hub_download  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise UserError(
             "fetching a network needs an optional package",
