@@ -42,7 +42,7 @@ def stray_photos(
         return [], np.ones(0 if points is None else len(points), bool)
     nobody = [], np.ones(len(points), bool)
     seen, held = np.moveaxis(
-        [
+        [  # pyright: ignore[reportArgumentType]
             expected_points(camera, mask, points)
             for camera, mask in zip(cameras, masks, strict=True)
         ],

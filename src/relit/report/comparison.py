@@ -147,4 +147,4 @@ def shrunk_camera(camera: Camera, side: int) -> Camera:
 
 def resized(image: np.ndarray, camera: Camera) -> np.ndarray:
     """A linear picture at the size of `camera`, by the mean over areas."""
-    return shrunk_to_camera(np.ascontiguousarray(image, dtype=np.float32), camera)
+    return shrunk_to_camera(np.ascontiguousarray(image, dtype=np.float32), camera)  # pyright: ignore[reportReturnType]

@@ -126,7 +126,7 @@ def _channels(asset: Asset) -> str:
         :2
     ]:  # the first and the middle one: the last often stands beside the first
         small = shrunk_camera(camera, SIDE)
-        c = render_maps(scene, small) if flash else render_channels(scene, small, spp=16)
+        c = render_maps(scene, small) if flash else render_channels(scene, small, spp=16)  # pyright: ignore[reportArgumentType]
         a = c["coverage" if flash else "alpha"][..., None]
         if flash:
             shown = {
