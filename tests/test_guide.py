@@ -9,12 +9,15 @@ import re
 import runpy
 import shlex
 import sys
+import textwrap
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from relit.asset.asset import load_asset
+from relit.capture.open import READERS, open_capture
 from relit.cli.verbs import VERBS, parser_for
 from relit.errors import UserError
 from relit.evaluate.collection import DEFINITIONS as COLLECTION
@@ -23,6 +26,7 @@ from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS as DUPLICATES
 from relit.evaluate.flash import FLASH_DEFINITIONS as FLASH
 from relit.files import parse_toml
 from relit.viewer.page import PAGE
+from support import camera_ring
 from support.striped_ball import write_capture
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -92,6 +96,21 @@ def test_every_command_of_the_guide_parses(line):
         assert parser_for(verb, words).parse(words) is not None
     except UserError as error:
         pytest.fail(f"{line}: {error}")
+
+
+def test_reader_of_contributing(monkeypatch, tmp_path):
+    """The reader and its test in CONTRIBUTING.md work as printed."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    reader, check = re.findall(r"^ *```python\n(.*?)^ *```", text, re.S | re.M)
+    module = types.ModuleType("my_format")
+    exec(reader, module.__dict__)
+    general = READERS["photos"]  # recognises every folder of photos, so it comes last
+    monkeypatch.delitem(READERS, "photos")
+    monkeypatch.setitem(READERS, "my_format", module)
+    monkeypatch.setitem(READERS, "photos", general)
+    names = {"np": np, "json": json, "open_capture": open_capture, "camera_ring": camera_ring}
+    exec(textwrap.dedent(check), names)
+    names["test_my_format"](tmp_path, camera_ring.ring())
 
 
 def test_every_link_leads_somewhere():
