@@ -1,5 +1,5 @@
-"""The guide is true: its examples run, its commands parse, its links lead somewhere, its tables
-name what is there."""
+"""The documents: examples run, commands parse, links have targets, named code exists, lines are
+short."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def example(monkeypatch, capsys, number, *argv) -> str:
     return capsys.readouterr().out
 
 
-def test_examples_in_their_order(monkeypatch, capsys, folder):
+def test_examples_in_order(monkeypatch, capsys, folder):
     import relit.fit.multiview.recipe as multiview
     from relit.report import page as report
 
@@ -74,7 +74,7 @@ def test_examples_in_their_order(monkeypatch, capsys, folder):
     )
 
 
-def test_examples_are_numbered_and_say_how_they_are_run():
+def test_examples_are_numbered_and_have_a_usage_line():
     assert [int(p.name[:2]) for p in EXAMPLES] == list(range(1, len(EXAMPLES) + 1))
     assert all(f"python examples/{p.name} " in p.read_text() for p in EXAMPLES)
 
@@ -113,7 +113,7 @@ def test_reader_of_contributing(monkeypatch, tmp_path):
     names["test_my_format"](tmp_path, camera_ring.ring())
 
 
-def test_every_link_leads_somewhere():
+def test_links_have_targets():
     lost = []
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
@@ -185,9 +185,8 @@ def test_modules_of_the_architecture_are_all_packages():
     assert order == sorted(order, reverse=True)
 
 
-def told_flags(verb, kind) -> set[str]:
-    """The flags that docs/flags.md tells of a verb, and of a kind of its, each under its own
-    heading."""
+def listed_flags(verb, kind) -> set[str]:
+    """The flags that docs/flags.md lists for a verb, and for one of its kinds."""
     text = (ROOT / "docs/flags.md").read_text(encoding="utf-8")
     sections = dict(part.split("\n", 1) for part in re.split(r"^##+ relit ", text, flags=re.M)[1:])
     found = sections[verb] + (
@@ -204,21 +203,23 @@ def told_flags(verb, kind) -> set[str]:
 @pytest.mark.parametrize(
     "verb, kind", [(v, k) for v, spec in VERBS.items() for k in (list(spec.kinds) or [None])]
 )
-def test_every_flag_of_every_verb_is_told_where_it_is_looked_for(verb, kind):
+def test_flags_page_lists_all_flags(verb, kind):
     known = {
         o
         for a in parser_for(verb, [kind] if kind else [])._actions
         if a.dest != "help"
         for o in a.option_strings
     }
-    assert told_flags(verb, kind and f"{verb} {kind}") == known
+    assert listed_flags(verb, kind and f"{verb} {kind}") == known
 
 
-def test_every_figure_is_explained():
-    told = set(re.findall(r"^\| `([a-z_0-9]+)` \|", (ROOT / "docs/figures.md").read_text(), re.M))
+def test_figures_page_defines_all_figures():
+    defined = set(
+        re.findall(r"^\| `([a-z_0-9]+)` \|", (ROOT / "docs/figures.md").read_text(), re.M)
+    )
     assert (
-        told == {name for some in (DEFINITIONS, FLASH, COLLECTION, DUPLICATES) for name in some}
-        and len(told) > 10
+        defined == {name for some in (DEFINITIONS, FLASH, COLLECTION, DUPLICATES) for name in some}
+        and len(defined) > 10
     )
 
 

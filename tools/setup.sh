@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Makes .venv with Relit and everything it needs: a Python 3.10-3.13, the wheels, libLLVM. Run it through `make setup`.
-# Environment: PYTHON (interpreter to use), VENV (folder of the virtual environment, default .venv).
+# Creates .venv with Python 3.10-3.13, Relit, its wheels and libLLVM. Run it through `make setup`.
+# Environment: PYTHON (interpreter), VENV (folder of the virtual environment, default .venv).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 VENV=${VENV:-.venv}
-STAMP=$VENV/.relit-setup # holds the path it was made at: a virtual environment cannot be moved
+STAMP=$VENV/.relit-setup # contains the path of creation: a virtual environment cannot be moved
 
 if [ "$(cat "$STAMP" 2>/dev/null)" = "$PWD" ] && [ "$STAMP" -nt pyproject.toml ] && [ "$STAMP" -nt tools/setup.sh ] && [ -x "$VENV/bin/relit" ]; then
     exit 0
@@ -18,17 +18,17 @@ fail() { # what, why, fix
     exit 5
 }
 
-as_root() { # run a command as root, or say that it cannot be done
+as_root() { # run a command as root; false if that is not possible
     if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null && sudo -n true 2>/dev/null; then sudo -n "$@"; else return 1; fi
 }
 
-apt_install() { # packages; true only when they were installed
+apt_install() { # true only if all packages were installed
     command -v apt-get >/dev/null || return 1
     as_root true || return 1
     if as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "$@" >/dev/null 2>&1; then return 0; fi
     if [ -z "${UPDATED:-}" ]; then
         UPDATED=1
-        as_root apt-get update -q >/dev/null 2>&1 || say "apt-get update did not succeed; going on with the package lists at hand"
+        as_root apt-get update -q >/dev/null 2>&1 || say "apt-get update failed; using the existing package lists"
         as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "$@" >/dev/null 2>&1 && return 0
     fi
     return 1
@@ -44,7 +44,7 @@ find_python() {
             return
         fi
     done
-    fail "no Python 3.10-3.13 was found" "Relit's wheels exist for these versions only" "sudo apt-get install -y python3 python3-venv, or make setup PYTHON=/path/to/python3.12"
+    fail "no Python 3.10-3.13 was found" "the wheels exist for these versions only" "sudo apt-get install -y python3 python3-venv, or make setup PYTHON=/path/to/python3.12"
 }
 
 make_venv() {
@@ -58,13 +58,14 @@ make_venv() {
     version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
     apt_install "python$version-venv" || apt_install python3-venv || true
     "$python" -m venv --clear "$VENV" >/dev/null 2>&1 ||
-        fail "Python's venv module does not work" "Debian and Ubuntu ship it in a package of its own" "sudo apt-get install -y python$version-venv"
+        fail "Python's venv module does not work" "Debian and Ubuntu have it in a separate package" "sudo apt-get install -y python$version-venv"
 }
 
 install_wheels() {
     say "wheels: pip install -e .[dev]"
     "$VENV/bin/python" -m pip install -q --disable-pip-version-check -e '.[dev]' ||
-        fail "pip could not install the wheels" "its message is above; most often there is no way to the package index" "mend the network or set PIP_INDEX_URL, then make setup again"
+        fail "pip could not install the wheels" "see its message above; often the package index is unreachable" \
+            "check the network or set PIP_INDEX_URL, then run make setup again"
 }
 
 find_llvm() { "$VENV/bin/python" -c 'from relit.device import find_libllvm as f; print(f() or "")'; }
@@ -80,11 +81,11 @@ install_llvm() {
         fi
     done
     if [ -e /proc/driver/nvidia/version ] || ldconfig -p 2>/dev/null | grep -q libcuda.so.1; then
-        say "libLLVM is missing: only --device cuda will work. To mend it: sudo apt-get install -y libllvm19"
+        say "libLLVM is missing: only --device cuda will work. To fix: sudo apt-get install -y libllvm19"
         return
     fi
-    fail "libLLVM 17 or newer is missing" "Relit compiles its kernels with it; it is in no wheel and could not be installed from here" \
-        "sudo apt-get install -y libllvm19, then make setup again (or set DRJIT_LIBLLVM_PATH to the file)"
+    fail "libLLVM 17 or newer is missing" "Dr.Jit compiles kernels with it; no wheel contains it, and apt-get could not install it" \
+        "sudo apt-get install -y libllvm19, then run make setup again (or set DRJIT_LIBLLVM_PATH)"
 }
 
 make_venv

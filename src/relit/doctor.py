@@ -214,13 +214,13 @@ def _gradient(device: str) -> Check:
     fix = LLVM_FIX if device == "cpu" else "update the NVIDIA driver, or use --device cpu"
     last = next((line for line in done.stdout.splitlines() if line.startswith("gradient ")), "")
     if done.returncode or not last:
-        said = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        last_line = (done.stderr.strip().splitlines() or ["nothing"])[-1]
         how = (
             f"killed by signal {-done.returncode}"
             if done.returncode < 0
             else f"exit code {done.returncode}"
         )
-        return Check(name, False, f"the test process ended ({how}): {said}", fix)
+        return Check(name, False, f"the test process ended ({how}): {last_line}", fix)
     gradient, difference = (float(x) for x in last.split()[1:])
     off = abs(gradient - difference) / max(abs(difference), 1e-9)
     found = f"{gradient:.5f}, finite difference {difference:.5f} ({100 * off:.2f} % error)"

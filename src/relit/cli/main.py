@@ -132,19 +132,19 @@ def _unexpected(error: Exception, argv: list[str]) -> int:
     if isinstance(error, OSError):
         from relit.files import disk_error
 
-        mended = disk_error(
+        known = disk_error(
             error, Path(error.filename).parent if isinstance(error.filename, str) else Path.cwd()
         )
-        if mended:
-            return _report(mended)
+        if known:
+            return _report(known)
     if os.environ.get("RELIT_DEBUG") == "1":
         traceback.print_exception(error, file=sys.stderr)
     text = (
         f"relit {__version__}: relit {' '.join(argv)}\n{''.join(traceback.format_exception(error))}"
     )
     where = _keep(text, argv)
-    said = f"error: {type(error).__name__}: {error}\nwhy: this is a bug in Relit, not in your input\nfix: report it with {where}"
-    print(said, file=sys.stderr)
+    message = f"error: {type(error).__name__}: {error}\nwhy: this is a bug in Relit, not in your input\nfix: report it with {where}"
+    print(message, file=sys.stderr)
     return EXIT_BUG
 
 

@@ -130,17 +130,17 @@ def overlaid(x: Look, capture: Capture) -> np.ndarray:
 
 def _thumbnail(x: Look, capture: Capture, row: dict) -> str:
     e = x.exif
-    said = [f"{row['ev']:+.1f} EV", f"sharpness {row['sharpness']:.2f}"]
-    said += (
+    parts = [f"{row['ev']:+.1f} EV", f"sharpness {row['sharpness']:.2f}"]
+    parts += (
         [f"1/{1 / e.exposure:.0f} s" if e.exposure < 0.5 else f"{e.exposure:.1f} s"]
         if e.exposure
         else []
     )
-    said += [f"f/{e.fnumber:.1f}"] if e.fnumber else []
-    said += [f"ISO {e.iso:.0f}"] if e.iso else []
-    said += ["flash"] if e.flash else []
-    said += [e.camera] if e.camera else []
-    return _figure(overlaid(x, capture), f"{x.name}: {', '.join(said)}")
+    parts += [f"f/{e.fnumber:.1f}"] if e.fnumber else []
+    parts += [f"ISO {e.iso:.0f}"] if e.iso else []
+    parts += ["flash"] if e.flash else []
+    parts += [e.camera] if e.camera else []
+    return _figure(overlaid(x, capture), f"{x.name}: {', '.join(parts)}")
 
 
 def _worst(pairs: list[MatchedPair]) -> list[MatchedPair]:
