@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from relit.benchmark import SUITES, Item, Suite, run_suite, runner
+from relit.benchmark import SUITES, Item, Suite, SuiteOptions, run_suite, runner
 from relit.benchmark.cost import timed
+from relit.benchmark.records import read_record
 from relit.benchmark.results import means, verdict
 from relit.benchmark.suites import function_at
 from relit.errors import EXIT_FAILED, UserError
@@ -103,9 +104,9 @@ def test_wrong_names_are_answered(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="multiview"):
         run_suite("multivew")
     with pytest.raises(UserError, match="spot"):
-        run_suite("multiview", objects=["spto"])
+        run_suite("multiview", SuiteOptions(objects=["spto"]))
     with pytest.raises(UserError, match="ablation"):
-        run_suite("multiview", ablate=["nonsense"])
+        run_suite("multiview", SuiteOptions(ablate=["nonsense"]))
     with pytest.raises(UserError, match="assets are not there"):
         runner.data_folder(tmp_path)
     monkeypatch.setenv("RELIT_CACHE", str(tmp_path / "c"))
@@ -159,8 +160,8 @@ def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
     folder, data = tiny
     commands = []
 
-    def stand_in(capture, out, kind, quality, device, seed, words=()):
-        commands.append((kind, quality, words))
+    def stand_in(capture, out, target):
+        commands.append((target.kind, target.quality, target.words))
         return [
             sys.executable,
             "-c",
@@ -171,7 +172,9 @@ def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
     options = dict(
         assets=data, cache=folder / "cache", device="cpu", spp=16, ablate=["shallow", "max_depth=3"]
     )
-    result = run_suite("tiny", out=folder / "out", json_file=folder / "r" / "x.json", **options)
+    result = run_suite(
+        "tiny", SuiteOptions(out=folder / "out", json_file=folder / "r" / "x.json", **options)
+    )
     assert commands == [
         ("multiview", "standard", w)
         for w in ((), ("max_depth=2", "--masks=none"), ("max_depth=3",))
@@ -183,11 +186,10 @@ def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
         and plain["peak_memory"]["value"] > 0
     )
     assert result["means"]["plain"]["relit_psnr"] == plain["relit_psnr"]["value"]
-    assert (
-        json.loads((folder / "r" / "x.json").read_text())
-        == json.loads((folder / "out" / "results.json").read_text())
-        == result
-    )
+    assert json.loads((folder / "out" / "results.json").read_text()) == result
+    record = read_record(folder / "r" / "x.json")
+    assert record.runs["plain"]["ball"]["relit_psnr"] == plain["relit_psnr"]["value"]
+    assert record.definitions["relit_psnr"][0] == "dB" and record.commit
     text = (folder / "out" / "results.md").read_text()
     assert (
         "### max_depth=3" in text
@@ -200,9 +202,9 @@ def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
     captures = list((folder / "cache" / "captures").iterdir())
     stamp = (captures[0] / "truth" / "truth.json").stat().st_mtime_ns
     with pytest.raises(
-        UserError, match="already"
+        UserError, match="exists already"
     ):  # a run that is there would be resumed, and its time would mean nothing
-        run_suite("tiny", out=folder / "out", **options)
+        run_suite("tiny", SuiteOptions(out=folder / "out", **options))
     assert list((folder / "cache" / "captures").iterdir()) == captures
     assert (captures[0] / "truth" / "truth.json").stat().st_mtime_ns == stamp
     shutil.rmtree(folder / "cache")
@@ -210,7 +212,9 @@ def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
 
 def test_the_command_is_the_one_a_user_would_give(tmp_path):
     command = runner.reconstruct_command(
-        tmp_path / "c", tmp_path / "o", "multiview", "draft", "cpu", 3, ["a=1", "--masks=none"]
+        tmp_path / "c",
+        tmp_path / "o",
+        runner.Target("multiview", "draft", "cpu", 3, ("a=1", "--masks=none")),
     )
     assert command[:4] == [sys.executable, "-m", "relit", "reconstruct"]
     assert command[-3:] == ["--set", "a=1", "--masks=none"] and "draft" in command
@@ -223,8 +227,8 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tiny, monkeypatch, capsys
     folder, data = tiny
     broken = {"max_depth=3"}
 
-    def stand_in(capture, out, kind, quality, device, seed, words=()):
-        if broken & {*words} or "all" in broken:
+    def stand_in(capture, out, target):
+        if broken & {*target.words} or "all" in broken:
             return [sys.executable, "-c", "print('no pair is linked'); raise SystemExit(4)"]
         return [
             sys.executable,
@@ -234,7 +238,9 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tiny, monkeypatch, capsys
 
     monkeypatch.setattr(runner, "reconstruct_command", stand_in)
     options = dict(assets=data, cache=folder / "cache", device="cpu", spp=16)
-    result = run_suite("tiny", out=folder / "out", ablate=["max_depth=3", "shallow"], **options)
+    result = run_suite(
+        "tiny", SuiteOptions(out=folder / "out", ablate=["max_depth=3", "shallow"], **options)
+    )
     assert (
         "no pair is linked" in result["failed"]["max_depth=3"]["ball"]
         and result["means"]["max_depth=3"] == {}
@@ -251,6 +257,6 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tiny, monkeypatch, capsys
 
     broken.add("all")
     with pytest.raises(UserError, match="1 of 1 runs failed") as error:
-        run_suite("tiny", out=folder / "again", **options)
+        run_suite("tiny", SuiteOptions(out=folder / "again", **options))
     assert error.value.code == EXIT_FAILED and "no pair is linked" in error.value.why
     assert json.loads((folder / "again" / "results.json").read_text())["failed"]["plain"]["ball"]

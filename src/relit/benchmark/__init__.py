@@ -4,9 +4,12 @@ suites.py     what is measured: objects, lights, bars, ablations of each suite
 runner.py     the run over a suite
 cost.py       time and memory of a command
 results.py    means, verdicts, tables
+records.py    one JSON file a run
+report.py     RESULTS.md from these files
+published.py  values that papers print
 """
 
-from relit.benchmark.runner import run_suite
+from relit.benchmark.runner import SuiteOptions, run_seeds, run_suite
 from relit.benchmark.suites import SUITES, Item, Suite
 
-__all__ = ["SUITES", "Item", "Suite", "run_suite"]
+__all__ = ["SUITES", "Item", "Suite", "SuiteOptions", "run_seeds", "run_suite"]

@@ -8,64 +8,86 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from relit.benchmark.cost import COST_DEFINITIONS, machine, timed
+from relit.benchmark.records import record_of, repository, state_of_code, write_record
 from relit.benchmark.results import markdown, means, means_table
 from relit.benchmark.suites import SUITES, Item, Suite, function_at
-from relit.errors import EXIT_FAILED, UserError, did_you_mean
+from relit.errors import EXIT_FAILED, EXIT_USAGE, UserError, did_you_mean
 from relit.evaluate.results import entries
 from relit.files import write_text
 
 
+@dataclass(frozen=True)
+class SuiteOptions:
+    """What a run over a suite is asked for.
+
+    assets: folder with `assets` and `envmaps`. cache: folder of the rendered captures. objects:
+    names to limit the suite to. ablate: names of the suite's ablations or `key=value`. out: folder
+    for the runs and the results, by default a new one in the cache. spp: samples per pixel of the
+    compared pictures, by default as many as `relit evaluate` takes. json_file: where the record of
+    the run is written (`relit.benchmark.records`); an existing file is not overwritten.
+    """
+
+    quality: str = "standard"
+    ablate: Sequence[str] = ()
+    objects: Sequence[str] = ()
+    device: str = "auto"
+    seed: int = 0
+    spp: int | None = None
+    cache: str | Path | None = None
+    assets: str | Path | None = None
+    out: str | Path | None = None
+    json_file: str | Path | None = None
+
+
 def run_suite(
-    suite: str = "multiview",
-    *,
-    quality: str = "standard",
-    ablate: Sequence[str] = (),
-    json_file: str | Path | None = None,
-    device: str = "auto",
-    cache: str | Path | None = None,
-    assets: str | Path | None = None,
-    objects: Sequence[str] = (),
-    out: str | Path | None = None,
-    spp: int | None = None,
-    seed: int = 0,
-    say: Callable[[str], None] = print,
+    suite: str, options: SuiteOptions = SuiteOptions(), say: Callable[[str], None] = print
 ) -> dict[str, Any]:
     """Synthesize, reconstruct and evaluate every object of a suite, plain and with each ablation.
 
-    assets: folder with `assets` and `envmaps`. objects: names to limit the suite to. ablate: names
-    of the suite's ablations or `key=value`.
-    out: folder for the runs and the results, by default a new one in the cache. spp: samples a
-    pixel of the compared pictures, by default as many as `relit evaluate` takes.
     Returns {"suite", "quality", "device", "machine", "runs": {variant: {object: {"metrics", ...}}},
-    "failed": {variant: {object: reason}}, "means": {variant: {figure: value}}}. What fails is told
-    and the others go on; a variant of which an object failed has no means.
-    Raises UserError (exit code 4) in the end if a plain run failed; an ablated one may, as that is
-    its result.
+    "failed": {variant: {object: reason}}, "means": {variant: {figure: value}}}. A failed object is
+    reported and the others go on; a variant of which an object failed has no means.
+    Raises UserError (exit code 4) in the end if a plain run failed; an ablated one may fail, as
+    that is its result.
     """
     from relit.device import use_device
 
-    spec, items = _chosen(suite, objects)
+    spec, items = _chosen(suite, options.objects)
     variants = {
         "plain": (),
-        **{name: spec.ablations.get(name, (name,)) for name in _checked_ablations(spec, ablate)},
+        **{
+            name: spec.ablations.get(name, (name,))
+            for name in _checked_ablations(spec, options.ablate)
+        },
     }
-    data, store = data_folder(assets), cache_folder(cache)
-    used = use_device(device)
+    data, store = data_folder(options.assets), cache_folder(options.cache)
+    used = use_device(options.device)
+    if options.json_file and Path(options.json_file).exists():
+        what = "the file for the record exists already"
+        fix = f"choose another --json, or remove it: {options.json_file}"
+        raise UserError(what, "nothing was overwritten", fix, code=EXIT_USAGE)
     folder = (
-        Path(out) if out else store / "runs" / f"{suite}-{quality}-{time.strftime('%Y%m%d-%H%M%S')}"
+        Path(options.out)
+        if options.out
+        else store / "runs" / f"{suite}-{options.quality}-{time.strftime('%Y%m%d-%H%M%S')}"
     )
     captures = {item.name: synthesize_item(spec, item, data, store, say) for item in items}
-    evaluate, samples = function_at(spec.evaluate), {} if spp is None else {"spp": spp}
+    evaluate, samples = (
+        function_at(spec.evaluate),
+        {} if options.spp is None else {"spp": options.spp},
+    )
 
     result: dict[str, Any] = {
         "suite": suite,
-        "quality": quality,
+        "quality": options.quality,
         "device": used,
-        "seed": seed,
+        "seed": options.seed,
         "machine": machine(),
         "runs": {},
         "failed": {},
@@ -75,44 +97,97 @@ def run_suite(
         result["runs"][variant], result["failed"][variant] = {}, {}
         for name, capture in captures.items():
             run = folder / f"{name}-{variant.replace('=', '_').replace('/', '_')}"
-            if run.exists():
-                raise UserError(
-                    "a run of that name is there already",
-                    "a resumed run cannot be timed",
-                    f"choose another folder: {run}",
-                )
-            command = reconstruct_command(
-                capture, run, spec.kind, quality, used, seed, (*spec.flags, *words)
-            )
-            say(f"{name} ({variant}): {' '.join(command[1:])}")
+            target = Target(spec.kind, options.quality, used, options.seed, (*spec.flags, *words))
             try:
-                seconds, memory = timed(command, folder / "logs" / f"{run.name}.txt")
-                say(f"{name} ({variant}): {seconds:.0f} s, {memory:.2f} GB; evaluating")
-                entry = evaluate(run, capture, **samples)
+                result["runs"][variant][name] = _measured(
+                    f"{name} ({variant})", capture, run, target, partial(evaluate, **samples), say
+                )
             except UserError as error:
+                if error.code == EXIT_USAGE:
+                    raise
                 say(f"{name} ({variant}): failed: {error}")
                 result["failed"][variant][name] = str(error)
-            else:
-                costs = entries({"seconds": seconds, "peak_memory": memory}, COST_DEFINITIONS)
-                entry["metrics"] = {**costs, **entry["metrics"]}
-                result["runs"][variant][name] = {**entry, "run": run.name, "capture": capture.name}
             result["means"][variant] = (
                 {} if result["failed"][variant] else means(result["runs"][variant])
             )
-            _save(result, spec, folder, json_file)
+            _save(result, spec, folder, options)
     from rich.console import Console
 
     Console(width=None if sys.stdout.isatty() else 160).print(means_table(result, spec))
-    say(f"results: {folder / 'results.json'}, {folder / 'results.md'}")
+    say(f"results: {options.json_file or folder / 'results.json'}, {folder / 'results.md'}")
     if failed := result["failed"]["plain"]:
-        reasons = "\n".join(f"{name}: {reason}" for name, reason in failed.items())
         raise UserError(
             f"{len(failed)} of {len(items)} runs failed",
-            reasons,
-            f"what did not: {folder / 'results.md'}",
+            "\n".join(f"{name}: {reason}" for name, reason in failed.items()),
+            f"see {folder / 'results.md'}",
             code=EXIT_FAILED,
         )
     return result
+
+
+@dataclass(frozen=True)
+class Target:
+    """What `relit reconstruct` is asked for. words: flags ('--masks=none') and settings
+    ('key=value')."""
+
+    kind: str
+    quality: str
+    device: str
+    seed: int
+    words: tuple[str, ...] = ()
+
+
+def _measured(
+    label: str,
+    capture: Path,
+    run: Path,
+    target: Target,
+    evaluate: Callable[[Path, Path], dict[str, Any]],
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Reconstruct a capture in a process of its own, and evaluate it: its entry of the result."""
+    if run.exists():
+        raise UserError(
+            "a run of that name exists already",
+            "the time of a resumed run would mean nothing",
+            f"choose another folder: {run}",
+            code=EXIT_USAGE,
+        )
+    command = reconstruct_command(capture, run, target)
+    say(f"{label}: {' '.join(command[1:])}")
+    seconds, memory = timed(command, run.parent / "logs" / f"{run.name}.txt")
+    say(f"{label}: {seconds:.0f} s, {memory:.2f} GB; evaluating")
+    entry = evaluate(run, capture)
+    costs = entries({"seconds": seconds, "peak_memory": memory}, COST_DEFINITIONS)
+    entry["metrics"] = {**costs, **entry["metrics"]}
+    return {**entry, "run": run.name, "capture": capture.name}
+
+
+def run_seeds(
+    suite: str, options: SuiteOptions, seeds: int, say: Callable[[str], None] = print
+) -> None:
+    """`run_suite` with several seeds, from options.seed on; each writes a record of its own.
+
+    A seed whose record exists already is left out, so that a stopped series goes on.
+    """
+    for seed in range(options.seed, options.seed + seeds):
+        file = record_file(suite, options, seed)
+        if file.exists():
+            say(f"seed {seed}: measured already: {file}")
+            continue
+        out = Path(options.out) / f"seed-{seed}" if options.out else None
+        run_suite(suite, replace(options, seed=seed, json_file=file, out=out), say)
+
+
+def record_file(suite: str, options: SuiteOptions, seed: int) -> Path:
+    """Where the record of one seed is written: options.json_file with the seed in its name, else
+    benchmarks/results/ of the checkout, else the working folder."""
+    if options.json_file:
+        given = Path(options.json_file)
+        return given.with_name(f"{given.stem}-{seed}{given.suffix or '.json'}")
+    root = repository()
+    folder = Path.cwd() if root is None else root / "benchmarks" / "results"
+    return folder / f"{suite}-{options.quality}-{state_of_code()[0]}-{seed}.json"
 
 
 def cache_folder(cache: str | Path | None = None) -> Path:
@@ -158,29 +233,12 @@ def synthesize_item(
     )
 
 
-def reconstruct_command(
-    capture: Path,
-    out: Path,
-    kind: str,
-    quality: str,
-    device: str,
-    seed: int,
-    words: Sequence[str] = (),
-) -> list[str]:
-    """The command line that is timed. words: flags ('--masks=none') and settings ('key=value')."""
-    command = [
-        sys.executable,
-        "-m",
-        "relit",
-        "reconstruct",
-        str(capture),
-        "-o",
-        str(out),
-        "--capture",
-        kind,
-    ]
-    command += ["--quality", quality, "--device", device, "--seed", str(seed)]
-    for word in words:
+def reconstruct_command(capture: Path, out: Path, target: Target) -> list[str]:
+    """The command line that is timed."""
+    command = [sys.executable, "-m", "relit", "reconstruct", str(capture), "-o", str(out)]
+    command += ["--capture", target.kind, "--quality", target.quality]
+    command += ["--device", target.device, "--seed", str(target.seed)]
+    for word in target.words:
         command += [word] if word.startswith("--") else ["--set", word]
     return command
 
@@ -215,9 +273,10 @@ def _checked_ablations(suite: Suite, ablate: Sequence[str]) -> list[str]:
     return list(ablate)
 
 
-def _save(result: dict[str, Any], suite: Suite, folder: Path, json_file: str | Path | None) -> None:
-    text = json.dumps(result, indent=1)
-    for target in [folder / "results.json", *([Path(json_file)] if json_file else [])]:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_text(target, text)
+def _save(result: dict[str, Any], suite: Suite, folder: Path, options: SuiteOptions) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "results.json", json.dumps(result, indent=1))
     write_text(folder / "results.md", markdown(result, suite))
+    if options.json_file:
+        asked = {"objects": list(options.objects), "ablate": list(options.ablate)}
+        write_record(record_of(result, {**asked, "spp": options.spp}), Path(options.json_file))

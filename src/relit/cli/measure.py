@@ -8,6 +8,8 @@ from pathlib import Path
 
 from relit.cli.parser import Parser, device_flag, job_flags, path_in
 
+RESULTS = Path("benchmarks/results")
+
 
 def evaluate_flags(parser: Parser) -> None:
     path_in(parser, "run", "run folder or asset folder")
@@ -44,32 +46,53 @@ def do_evaluate(args) -> None:
 def benchmark_flags(parser: Parser) -> None:
     from relit.benchmark.suites import SUITES
 
-    parser.add_argument("suite", help=f"name of a suite: {', '.join(SUITES)}")
+    parser.add_argument("suite", nargs="?", help=f"name of a suite: {', '.join(SUITES)}")
     job_flags(parser, "standard")
     add = parser.common.add_argument
-    add("--json", type=Path, default=None, metavar="FILE", help="write the figures there")
+    add("--json", type=Path, default=None, metavar="FILE", help="write the record of the run there")
     add("--ablate", default="", metavar="NAME,...", help="also run with these parts switched off")
+    seeds = "run seeds 0 ... N-1, each with a record in benchmarks/results; resumes"
+    add("--seeds", type=int, default=None, metavar="N", help=seeds)
+    report = "print RESULTS.md as generated from the records in DIR (default benchmarks/results)"
+    add("--report", nargs="?", const=RESULTS, type=Path, default=None, metavar="DIR", help=report)
     more = parser.more.add_argument
     more("--objects", default="", metavar="NAME,...", help="only these objects of the suite")
     more("--cache", type=Path, default=None, metavar="DIR", help="where rendered captures are kept")
     more(
         "--assets", type=Path, default=None, metavar="DIR", help="folder with assets/ and envmaps/"
     )
-    more("-o", "--out", type=Path, default=None, metavar="DIR", help="where the runs go")
+    out = "where the runs go; with --report the file to write"
+    more("-o", "--out", type=Path, default=None, metavar="PATH", help=out)
 
 
 def do_benchmark(args) -> None:
-    from relit.benchmark import run_suite
+    from relit.benchmark import SuiteOptions, run_seeds, run_suite
+    from relit.errors import EXIT_USAGE, UserError
+    from relit.files import write_text
 
-    run_suite(
-        args.suite,
+    if args.report is not None:
+        from relit.benchmark.report import report
+
+        text = report(args.report)
+        if args.out is None:
+            print(text, end="")
+        else:
+            write_text(args.out, text)
+        return
+    if args.suite is None:
+        raise UserError("no suite was named", fix="relit benchmark SUITE", code=EXIT_USAGE)
+    options = SuiteOptions(
         quality=args.quality,
         ablate=[a for a in args.ablate.split(",") if a],
-        json_file=args.json,
+        objects=[o for o in args.objects.split(",") if o],
         device=args.device,
+        seed=args.seed or 0,
         cache=args.cache,
         assets=args.assets,
-        objects=[o for o in args.objects.split(",") if o],
         out=args.out,
-        seed=args.seed or 0,
+        json_file=args.json,
     )
+    if args.seeds:
+        run_seeds(args.suite, options, args.seeds)
+    else:
+        run_suite(args.suite, options)

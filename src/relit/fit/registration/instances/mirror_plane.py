@@ -52,7 +52,7 @@ LEAD, LEAD_OF_TWO = (
     0.035,
     0.1,
     # of the best plane over the next one; the second where two instances tell it
-    # (benchmarks/duplicates_notes)
+    # (docs/research/instances.md)
 )
 KEEP = 0.03  # added to the scores of planes near the last one
 SLID = 20.0  # degrees
