@@ -214,9 +214,7 @@ def test_flags_page_lists_all_flags(verb, kind):
 
 
 def test_figures_page_defines_all_figures():
-    defined = set(
-        re.findall(r"^\| `([a-z_0-9]+)` \|", (ROOT / "docs/figures.md").read_text(), re.M)
-    )
+    defined = set(re.findall(r"^\* `([a-z_0-9]+)`", (ROOT / "docs/figures.md").read_text(), re.M))
     assert (
         defined == {name for some in (DEFINITIONS, FLASH, COLLECTION, DUPLICATES) for name in some}
         and len(defined) > 10

@@ -53,7 +53,7 @@ def benchmark_flags(parser: Parser) -> None:
     add("--ablate", default="", metavar="NAME,...", help="also run with these parts switched off")
     seeds = "run seeds 0 ... N-1, each with a record in benchmarks/results; resumes"
     add("--seeds", type=int, default=None, metavar="N", help=seeds)
-    report = "print RESULTS.md as generated from the records in DIR (default benchmarks/results)"
+    report = "print RESULTS.md from the records in DIR (default benchmarks/results)"
     add("--report", nargs="?", const=RESULTS, type=Path, default=None, metavar="DIR", help=report)
     more = parser.more.add_argument
     more("--objects", default="", metavar="NAME,...", help="only these objects of the suite")
