@@ -303,7 +303,7 @@ def _encoder(path: Path, width: int, height: int) -> tuple[Callable, Callable]:
             str(path),
             cv2.VideoWriter_fourcc(*"mp4v"),  # pyright: ignore[reportAttributeAccessIssue]
             FRAMES_PER_SECOND,
-            (width, height),  # pyright: ignore[reportAttributeAccessIssue]
+            (width, height),
         )
         if not writer.isOpened():
             fix = "pip install 'relit[video]', or write pictures to a folder"

@@ -136,7 +136,7 @@ def open_capture(
                 reading.sphere,
                 reading.presumed,
                 [views[i] for i in train],  # pyright: ignore[reportArgumentType]
-                reading.points,  # pyright: ignore[reportArgumentType]
+                reading.points,
             )
             notes += [f"the object sphere was found from {source}"] if source else []
         notes += check_sphere(sphere, cameras)  # pyright: ignore[reportArgumentType]

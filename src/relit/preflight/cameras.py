@@ -41,7 +41,8 @@ def fundamental(first: Camera, second: Camera) -> np.ndarray:
 
 def match(first: Look, second: Look) -> MatchedPair | None:
     """SIFT matches (ratio test, mutual) of two photos and their distances to the epipolar lines, or
-    None for too few."""
+    None for too few. Both photos have cameras."""
+    assert first.camera is not None and second.camera is not None
     sift = cv2.SIFT_create(nfeatures=1500)  # pyright: ignore[reportAttributeAccessIssue]
     found = []
     for x in (first, second):
@@ -67,7 +68,7 @@ def match(first: Look, second: Look) -> MatchedPair | None:
     # OpenCV's origin is the centre of the first pixel
     points = np.array([[ka[i].pt, kb[j].pt] for i, j in both]) + 0.5
     p, q = (np.concatenate([points[:, k], np.ones((len(points), 1))], 1) for k in (0, 1))
-    line = p @ fundamental(first.camera, second.camera).T  # pyright: ignore[reportArgumentType]
+    line = p @ fundamental(first.camera, second.camera).T
     distance = np.abs((q * line).sum(1)) / np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-12)
     return MatchedPair(first, second, points, distance)
 

@@ -133,7 +133,7 @@ def cameras_svg(capture: Capture) -> str | None:
     from relit.report.curves import camera_plot
 
     plot = camera_plot(
-        [p.camera for p in capture.photos],  # pyright: ignore[reportArgumentType]
+        [p.camera for p in capture.photos if p.camera is not None],
         _upright(capture) @ np.linalg.inv(capture.sphere.world_from_unit),
     )
     return plot.replace(

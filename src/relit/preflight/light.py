@@ -161,14 +161,10 @@ def shading_change(looks: list[Look]) -> float:
     percentile over bright pixels (inside the masks where there are some)."""
     stack = np.stack([cv2.resize(x.gray, (96, 96), interpolation=cv2.INTER_AREA) for x in looks])
     bright = stack.mean(0) > 0.25 * np.percentile(stack.mean(0), 95)
-    if all(x.mask is not None for x in looks):
-        inside = (
-            np.mean(
-                [cv2.resize(x.mask, (96, 96), interpolation=cv2.INTER_AREA) for x in looks],  # pyright: ignore[reportArgumentType, reportCallIssue]
-                axis=0,  # pyright: ignore[reportArgumentType, reportCallIssue]
-            )
-            > 0.9
-        )
+    masks = [x.mask for x in looks if x.mask is not None]
+    if len(masks) == len(looks):
+        small = [cv2.resize(m, (96, 96), interpolation=cv2.INTER_AREA) for m in masks]
+        inside = np.mean(small, axis=0) > 0.9
         bright = bright & inside if (bright & inside).sum() > 20 else bright
     stack = stack / np.maximum(np.median(stack[:, bright], axis=1), 1e-6)[:, None, None]
     return float(np.percentile((stack.std(0) / np.maximum(stack.mean(0), 1e-6))[bright], 90))

@@ -69,17 +69,15 @@ def look(capture: Capture, photo: Photo) -> Look:
     h, w = pixels.rgb.shape[:2]
     s = min(1.0, SIDE / max(h, w))
     size = (max(1, round(w * s)), max(1, round(h * s)))
-    rgb, mask = (
-        None
-        if a is None
-        else cv2.resize(np.ascontiguousarray(a), size, interpolation=cv2.INTER_AREA)
-        for a in (pixels.rgb, pixels.mask)
-    )
+    rgb = cv2.resize(np.ascontiguousarray(pixels.rgb), size, interpolation=cv2.INTER_AREA)
+    mask = pixels.mask
+    if mask is not None:
+        mask = cv2.resize(np.ascontiguousarray(mask), size, interpolation=cv2.INTER_AREA)
     camera = None if photo.camera is None else photo.camera.resized(*size)
     path = capture.folder / photo.name
     return Look(
         photo.name,
-        rgb,  # pyright: ignore[reportArgumentType]
+        rgb,
         mask,
         camera,
         sharpness(pixels.rgb, pixels.mask),

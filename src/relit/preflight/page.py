@@ -154,7 +154,8 @@ def _worst(pairs: list[MatchedPair]) -> list[MatchedPair]:
 def _pair(p: MatchedPair) -> str:
     a, b = np.ascontiguousarray(_codes(p.first.rgb)), np.ascontiguousarray(_codes(p.second.rgb))
     h = max(a.shape[0], b.shape[0])
-    f = fundamental(p.first.camera, p.second.camera)  # pyright: ignore[reportArgumentType]
+    assert p.first.camera is not None and p.second.camera is not None
+    f = fundamental(p.first.camera, p.second.camera)
     chosen = np.linspace(0, len(p.points) - 1, min(LINES, len(p.points))).round().astype(int)
     for k, i in enumerate(chosen):
         colour = tuple(
@@ -171,7 +172,8 @@ def _pair(p: MatchedPair) -> str:
             else [(-l2 / l0, 0.0), (-(l2 + l1 * b.shape[0]) / l0, b.shape[0])]
         )
         if np.isfinite(ends).all() and np.abs(ends).max() < 1e5:
-            cv2.line(b, *[tuple(round(float(v)) for v in e) for e in ends], colour, 1, cv2.LINE_AA)  # pyright: ignore[reportCallIssue]
+            start, end = (tuple(round(float(v)) for v in e) for e in ends)
+            cv2.line(b, start, end, colour, 1, cv2.LINE_AA)
         cv2.circle(a, tuple(round(float(v)) for v in q), 4, colour, 2, cv2.LINE_AA)
         cv2.circle(b, tuple(round(float(v)) for v in r), 4, colour, 2, cv2.LINE_AA)
     both = np.concatenate([np.pad(x, ((0, h - x.shape[0]), (0, 0), (0, 0))) for x in (a, b)], 1)
