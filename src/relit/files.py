@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+import tomli_w
 
 from relit.errors import EXIT_ENVIRONMENT, UserError
 from relit.log import readable_bytes
@@ -99,19 +100,9 @@ def digests(root: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def toml_text(config: dict) -> str:
-    """TOML of a dictionary: strings, numbers, booleans, lists of those, and one level of tables.
-    None is left out."""
-    plain = [
-        f"{key} = {_toml_value(v)}"
-        for key, v in config.items()
-        if v is not None and not isinstance(v, dict)
-    ]
-    for key, table in config.items():
-        if isinstance(table, dict):
-            plain += ["", f"[{key}]"] + [
-                f"{k} = {_toml_value(v)}" for k, v in table.items() if v is not None
-            ]
-    return "\n".join(plain) + "\n"
+    """TOML of a dictionary: strings, numbers, booleans, lists of those, and tables. None is left
+    out. Raises TypeError for other values."""
+    return tomli_w.dumps(_plain(config))
 
 
 def parse_toml(text: str) -> dict:
@@ -119,18 +110,15 @@ def parse_toml(text: str) -> dict:
     return tomllib.loads(text)
 
 
-def _toml_value(value) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (int, np.integer)):
-        return str(int(value))
-    if isinstance(value, (float, np.floating)):
-        return repr(float(value))
+def _plain(value):
+    """The value with paths as text, NumPy numbers as Python's, and without None in tables."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items() if v is not None}
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    if isinstance(value, (str, Path)):
-        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
-    raise TypeError(f"no TOML for {type(value).__name__}")
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return str(value) if isinstance(value, Path) else value
 
 
 def read_json(path: Path) -> dict | None:
