@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -60,7 +61,9 @@ def on_files(files, config):
     """Add the pages of OUTSIDE and API."""
     for page, source in OUTSIDE.items():
         text = (ROOT / source).read_text(encoding="utf-8")
-        files.append(File.generated(config, page, content=_relinked(text, (ROOT / source).parent)))
+        files.append(
+            File.generated(config, page, content=_relinked(text, (ROOT / source).parent, "."))
+        )
     for name, (title, modules) in API.items():
         text = "\n\n".join([f"# {title}", *(f"::: {m}" for m in modules)])
         files.append(File.generated(config, f"api/{name}.md", content=text + "\n"))
@@ -70,12 +73,13 @@ def on_files(files, config):
 def on_page_markdown(markdown, page, config, files):
     """Links of pages in docs/ to files outside docs/."""
     path = ROOT / "docs" / page.file.src_uri
-    return _relinked(markdown, path.parent) if path.is_file() else markdown
+    folder = str(Path(page.file.src_uri).parent)
+    return _relinked(markdown, path.parent, folder) if path.is_file() else markdown
 
 
-def _relinked(text: str, folder: Path) -> str:
+def _relinked(text: str, folder: Path, at: str) -> str:
     """Links to files of the repository as links of the site; a file that has no page becomes plain
-    text."""
+    text. folder: of the file that holds the text. at: folder of its page in the site."""
     page_of = {(ROOT / source).resolve(): page for page, source in OUTSIDE.items()}
 
     def link(match: re.Match) -> str:
@@ -84,10 +88,10 @@ def _relinked(text: str, folder: Path) -> str:
         if "://" in target or not path.exists():
             return match[0]
         if path in page_of:
-            return f"[{label}]({page_of[path]}{anchor})"
+            return f"[{label}]({os.path.relpath(page_of[path], at)}{anchor})"
         docs = ROOT / "docs"
         if path.is_relative_to(docs):
-            return f"[{label}]({path.relative_to(docs).as_posix()}{anchor})"
+            return f"[{label}]({os.path.relpath(path.relative_to(docs), at)}{anchor})"
         return f"`{path.relative_to(ROOT).as_posix()}`"
 
     return re.sub(r"\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)", link, text)
