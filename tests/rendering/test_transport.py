@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from relit.fit.passes.losses import dual_loss
 from relit.fit.passes.pixels import camera_rows, rays_through
-from relit.fit.passes.surface import dual_loss
 from relit.lighting.environment import Environment
 from relit.materials.field import MaterialField, material_at, pictures
 from relit.reference.mitsuba_scene import build_scene, render

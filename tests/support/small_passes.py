@@ -8,13 +8,15 @@ import numpy as np
 
 from relit.fit.collection.surface import (
     LightOptions,
+    PhotoLightTerms,
     fit_collection_surface,
     start_collection_surface,
 )
 from relit.fit.flash.lobe_clusters import start_kinship
 from relit.fit.flash.recipe import rates_by_step
-from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
-from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions, fit_surface, start_surface
+from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, FlashTerms, fit_flash_surface
+from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
+from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
 from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
 from relit.fit.registration.instances.views import hold_distances, move_poses
 from relit.geometry.sdf import node_positions
@@ -67,14 +69,8 @@ def flash_surface(shot, stage):
     model = FlashModel(
         field, mi.Float(features.ravel()), kinship, mi.Float(0, 0, 0), mi.Float([1.5]), Coat()
     )
-    fit_flash_surface(
-        bank,
-        cameras,
-        mesh,
-        model,
-        FlashSurfaceOptions(STEPS, 128, 1, 1, patches=0.1, share_every=45),
-        stage,
-    )
+    options = FlashSurfaceOptions(STEPS, 128, 1, 1, patches=0.1, share_every=45)
+    fit_flash_surface(FlashTerms(bank, cameras, mesh, model, options), stage)
 
 
 def collection_volume(shot, stage):
@@ -96,9 +92,8 @@ def collection_surface(shot, stage):
         TEXELS, np.full((TEXELS, TEXELS, 3), ALBEDO_START, np.float32), 0.5, 0.05
     )
     model = start_collection_surface(material, np.full((bank.views, 3), 0.3), ALBEDO_START)
-    fit_collection_surface(
-        bank, mesh, model, SurfaceOptions(**SURFACE), LightOptions(anchor=0.1), stage
-    )
+    terms = PhotoLightTerms(bank, mesh, model, SurfaceOptions(**SURFACE), LightOptions(anchor=0.1))
+    fit_collection_surface(terms, stage)
 
 
 def duplicates_volume(shot, stage):
@@ -121,7 +116,7 @@ def duplicates_surface(shot, stage):
     known = np.ones((TEXELS, TEXELS), bool)
     model = start_surface(np.full((TEXELS, TEXELS, 3), 0.3, np.float32), known, 0.3, o)
     model.gaussians = GaussianLight(6, o.light, 0.3 / ALBEDO_START)
-    fit_surface(bank, mesh, model, o, stage)
+    fit_surface(EnvironmentTerms(bank, mesh, model, o), stage)
 
 
 PASSES = [

@@ -329,12 +329,13 @@ def test_the_surface_pass_takes_the_network_and_the_first_colours(tmp_path):
 
     from relit.fit.collection.surface import (
         LightOptions,
+        PhotoLightTerms,
         fit_collection_surface,
         start_collection_surface,
     )
+    from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
     from relit.fit.passes.optimiser import NoStage
     from relit.fit.passes.pixels import make_bank
-    from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions
     from relit.geometry.se3 import look_at
     from relit.lighting.neural_pil import load_neural_pil
     from relit.materials.field import start_material
@@ -358,15 +359,8 @@ def test_the_surface_pass_takes_the_network_and_the_first_colours(tmp_path):
         model = start_collection_surface(material, np.full((2, 3), 0.3), ALBEDO_START, network)
         options = SurfaceOptions(6, 96, 8, 16, warm=0.01)
         light = LightOptions(anchor=anchor, lambda_a=100.0)
-        fit_collection_surface(
-            bank,
-            TraceableMesh(mesh, np.full((len(mesh.vertices), 3), 0.4)),
-            model,
-            options,
-            light,
-            NoStage(),
-            0,
-        )
+        traced = TraceableMesh(mesh, np.full((len(mesh.vertices), 3), 0.4))
+        fit_collection_surface(PhotoLightTerms(bank, traced, model, options, light), NoStage())
         assert (
             model.coefficients.shape == (2, network.size)
             and np.abs(model.coefficients).max() > 1e-3

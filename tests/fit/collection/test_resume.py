@@ -14,12 +14,13 @@ from relit.fit.collection import surface as collection_surface
 from relit.fit.collection.options import CollectionOptions
 from relit.fit.collection.surface import (
     LightOptions,
+    PhotoLightTerms,
     fit_collection_surface,
     start_collection_surface,
 )
+from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import make_bank
-from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions
 from relit.materials.field import start_material
 from relit.rendering.transport import TraceableMesh
 from relit.run import Run
@@ -73,9 +74,8 @@ def surface(bowl, saved=None, steps=1, **changes):
         begun = {n: np.array(getattr(material, n)) for n in ("colour", "metallic", "slope")}
         saved = begun | {n: getattr(model, n) for n in ("coefficients", "gains", "weights")} | saved
     o = SurfaceOptions(steps, 64, 8, 8)
-    return fit_collection_surface(
-        *bowl, model, o, LightOptions(**changes), NoStage() if saved is None else Resumed(saved)
-    )
+    terms = PhotoLightTerms(*bowl, model, o, LightOptions(**changes))
+    return fit_collection_surface(terms, NoStage() if saved is None else Resumed(saved))
 
 
 def test_what_blocks_a_light_keeps_its_brightness(bowl, monkeypatch):

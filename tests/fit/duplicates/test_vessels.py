@@ -14,7 +14,7 @@ from relit.fit.duplicates import shape, vessel_trial
 from relit.fit.duplicates.poses import all_views
 from relit.fit.duplicates.vessel_trial import FLOORS, lowest_of
 from relit.fit.duplicates.vessels import End, body_axis, ends_of, floor_under, hollowed, mouths
-from relit.fit.passes.surface import SurfaceOptions
+from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.hull import distance_of
 from relit.geometry.mesh import extract_mesh

@@ -110,7 +110,7 @@ def test_surface_pass(shot, monkeypatch, saturated):
     )
     options = FlashSurfaceOptions(steps=1, points=64 * 12, directions=0, patches=0.1)
     monkeypatch.setattr(bank, "saturated", saturated)
-    fit_flash_surface(bank, views, mesh, model, options, NoStage(), 0)
+    fit_flash_surface(flash_surface.FlashTerms(bank, views, mesh, model, options), NoStage())
     is_burnt = np.isin(np.arange(64 * 12), chosen)
     for weight in (*seen["share_evidence"], seen["pyramid_loss"][1], seen["ssim_loss"][1]):
         assert (weight[~is_burnt] > 0).any()

@@ -10,6 +10,7 @@ from relit.fit.flash.lobe_clusters import best_lobes, start_kinship
 from relit.fit.flash.surface import (
     FlashModel,
     FlashSurfaceOptions,
+    FlashTerms,
     brightest_albedo,
     calm_weights,
     fit_flash_surface,
@@ -116,7 +117,8 @@ def fitted(shot, kin=True, **options):
         Coat(),
     )
     settings = {"steps": 200, "points": 2048, "directions": 0, "offset_rate": 0.006, **options}
-    fit_flash_surface(bank, views, mesh, model, FlashSurfaceOptions(**settings), NoStage())
+    terms = FlashTerms(bank, views, mesh, model, FlashSurfaceOptions(**settings))
+    fit_flash_surface(terms, NoStage())
     return model
 
 

@@ -8,7 +8,7 @@ import pytest
 from relit.capture.open import open_capture
 from relit.fit.multiview.recipe import MultiviewOptions, reconstruct
 from relit.fit.passes import first_material as first
-from relit.fit.passes.surface import SurfaceOptions
+from relit.fit.passes.material_priors import SurfaceOptions
 from relit.run import Run
 
 SMALL = MultiviewOptions(
@@ -182,6 +182,7 @@ def test_the_fit_that_tells_dull_paint_is_spared_where_nothing_asks_for_it(
     begun = []
     monkeypatch.setattr(first, "start_surface", lambda *a: begun.append(a[3].roughness_start))
     monkeypatch.setattr(first, "fit_surface", lambda *a: None)
+    monkeypatch.setattr(first, "EnvironmentTerms", lambda *a: None)
     monkeypatch.setattr(
         first,
         "errors",

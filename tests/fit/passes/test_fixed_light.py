@@ -53,9 +53,8 @@ def test_a_resting_light_costs_nothing(monkeypatch):
         (surface.Exchange, "step"),
     ):
         counted(owner, name)
-    fit = surface.fit_surface(
-        bank, TraceableMesh(mesh, np.full(mesh.vertices.shape, 0.3)), model, OPTIONS, Watch(), 0
-    )
+    traced = TraceableMesh(mesh, np.full(mesh.vertices.shape, 0.3))
+    fit = surface.fit_surface(surface.EnvironmentTerms(bank, traced, model, OPTIONS), Watch())
     assert calls == {
         "parsimony": MOVING,
         "light_prior": MOVING,

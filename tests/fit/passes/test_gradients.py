@@ -14,18 +14,17 @@ import pytest
 
 from relit.conventions import environment_directions
 from relit.fit.duplicates.lit_pile import TINT, TOE
-from relit.fit.passes.losses import display_loss, mask_loss, normal_loss
-from relit.fit.passes.pixels import batch_of, make_bank
-from relit.fit.passes.surface import (
+from relit.fit.passes.losses import display_loss, dual_loss, mask_loss, normal_loss
+from relit.fit.passes.material_priors import (
     SurfaceOptions,
     common_scale,
-    dual_loss,
     light_prior,
     material_prior,
-    neighbour_points,
     parsimony,
     slope_prior,
 )
+from relit.fit.passes.pixels import batch_of, make_bank
+from relit.fit.passes.surface_loop import neighbour_points
 from relit.geometry.sdf import make_grid, node_positions
 from relit.geometry.se3 import look_at
 from relit.lighting.environment import Environment

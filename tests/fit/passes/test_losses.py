@@ -8,11 +8,12 @@ import pytest
 from relit.fit.passes.losses import (
     display_loss,
     display_weight,
+    dual_loss,
     mask_loss,
     normal_loss,
     weighted_mean,
 )
-from relit.fit.passes.surface import SurfaceOptions, dual_loss, light_prior
+from relit.fit.passes.material_priors import SurfaceOptions, light_prior
 
 N = 500
 

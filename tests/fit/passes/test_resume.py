@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from relit.fit.passes.explore import explore
+from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
-from relit.fit.passes.surface import SurfaceOptions, fit_surface, start_surface
+from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
 from relit.fit.passes.volume import VolumeOptions, fit_volume
 from relit.rendering.background import start_background
 from support.small_passes import PASSES, SURFACE, TEXELS, VOLUME, ball_model
@@ -30,7 +31,7 @@ def multiview_surface(shot, stage):
     model = start_surface(
         np.full((TEXELS, TEXELS, 3), 0.3, np.float32), np.ones((TEXELS, TEXELS), bool), 0.3, o
     )
-    fit_surface(bank, mesh, model, o, stage)
+    fit_surface(EnvironmentTerms(bank, mesh, model, o), stage)
 
 
 def field_of_everything(shot, stage):

@@ -12,14 +12,15 @@ import numpy as np
 from relit.fit.collection.options import CollectionOptions
 from relit.fit.collection.photos import CollectionPhoto, collection_crops
 from relit.fit.collection.surface import (
+    PhotoLightTerms,
     fit_collection_surface,
     light_family,
     light_options,
     start_collection_surface,
 )
+from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import corrected, make_bank
-from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.fit.registration.fine_detail import (
     compare_detail,
@@ -110,16 +111,9 @@ def held_out_stage(
             areas = vertex_areas(mesh)
             scale = ALBEDO_START / float((albedo * areas[:, None]).sum() / areas.sum() / 3)
             o = SurfaceOptions(options.frozen_steps, options.points, options.directions, size)
-            fit_collection_surface(
-                bank,
-                TraceableMesh(mesh, albedo * scale),
-                lit,
-                o,
-                light_options(options),
-                stage,
-                seed,
-                frozen=True,
-            )
+            traced = TraceableMesh(mesh, albedo * scale)
+            terms = PhotoLightTerms(bank, traced, lit, o, light_options(options), frozen=True)
+            fit_collection_surface(terms, stage, seed)
             kept = {
                 "poses": np.array([c.world_from_camera for c in found]),
                 "focal": np.array([c.fx for c in found]),

@@ -39,14 +39,15 @@ from relit.fit.collection.options import CollectionOptions, options_for
 from relit.fit.collection.photos import LEAST_PHOTOS, CollectionPhoto, collection_crops, load_shots
 from relit.fit.collection.shape import opened_stage, volume_stage
 from relit.fit.collection.surface import (
+    PhotoLightTerms,
     fit_collection_surface,
     light_family,
     light_options,
     posterior,
     start_collection_surface,
 )
+from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.pixels import PixelBank, place_cameras
-from relit.fit.passes.surface import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.volume import VolumeModel
 from relit.fit.registration.photos.growth import find_poses
 from relit.fit.registration.photos.poses import GREY, cross_validated_share, schedule_of
@@ -364,9 +365,9 @@ def surface_stage(
         )
         material = start_material(o.texture, start, o.roughness_start, 0.05)
         model = start_collection_surface(material, tints, ALBEDO_START, light_family(options))
-        fit_collection_surface(
-            bank, TraceableMesh(mesh, albedo * scale), model, o, light_options(options), stage, seed
-        )
+        traced = TraceableMesh(mesh, albedo * scale)
+        terms = PhotoLightTerms(bank, traced, model, o, light_options(options))
+        fit_collection_surface(terms, stage, seed)
         base, roughness, metallic = pictures(model.material)
         silent = int((model.weights < 0.3).sum())
         if silent:

@@ -7,7 +7,9 @@ the light of the photo that shows it. Lights are few numbers each under a learnt
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,19 +17,17 @@ import numpy as np
 
 from relit.fit.collection.options import CollectionOptions
 from relit.fit.passes.broad_steps import BroadSteps
-from relit.fit.passes.losses import display_weight, weighted_mean
-from relit.fit.passes.optimiser import Adam, cosine_decay, memory, recall, run_steps
-from relit.fit.passes.pixels import PixelBank, saturated_at
-from relit.fit.passes.preview import surface_preview
-from relit.fit.passes.surface import (
+from relit.fit.passes.losses import display_weight, dual_values, weighted_mean
+from relit.fit.passes.material_priors import (
     SurfaceOptions,
     common_scale,
-    drawn_points,
-    dual_values,
     material_prior,
-    neighbour_points,
     parsimony,
 )
+from relit.fit.passes.optimiser import Adam, Variable, cosine_decay
+from relit.fit.passes.pixels import PixelBank, saturated_at
+from relit.fit.passes.surface import MaterialSchedule
+from relit.fit.passes.surface_loop import drawn_points, neighbour_points, run_surface
 from relit.lighting.neural_pil import load_neural_pil
 from relit.lighting.per_photo import (
     TEXELS,
@@ -38,7 +38,13 @@ from relit.lighting.per_photo import (
     mean_level,
 )
 from relit.materials.field import MaterialField, material_at, project, slope_at
-from relit.rendering.transport import TraceableMesh, bent_normal, reflected, sample_lights
+from relit.rendering.transport import (
+    Points,
+    TraceableMesh,
+    bent_normal,
+    reflected,
+    sample_lights,
+)
 
 LEAST = (
     0.02  # weight of a silenced photo: the material hardly hears it, its own light still follows
@@ -132,208 +138,222 @@ def posterior(losses: np.ndarray, history: list[float]) -> np.ndarray:
     return np.clip(np.tanh((mean - losses) / max(deviation, 1e-6)) + 1, 0, 1).astype(np.float32)
 
 
-def fit_collection_surface(
-    bank: PixelBank,
-    mesh: TraceableMesh,
-    model: CollectionSurface,
-    options: SurfaceOptions,
-    light: LightOptions,
-    stage,
-    seed: int = 0,
-    frozen: bool = False,
-) -> CollectionSurface:
-    """Run the pass; returns the same model, optimised. frozen: only lights move (held-out photos).
-    Resumes from the stage's checkpoint."""
-    material, first, views, count = model.material, 0, bank.views, options.points
-    even = mean_level(model.family)
-    begun = (
-        np.exp(model.gains) * even
-    )  # (V, 3) light of each photo as the pass begins, which the mesh's own colours go with
-    running = np.zeros(views)
-    saved = stage.load("checkpoint")
-    if saved:
-        first = int(saved["step"])
-        material.colour, material.metallic, material.slope = (
-            mi.Float(saved[n]) for n in ("colour", "metallic", "slope")
-        )
-        model.coefficients, model.gains, model.weights = (
-            saved["coefficients"],
-            saved["gains"],
-            saved["weights"],
-        )
-        model.losses, running = (
-            saved.get("losses", np.zeros(0)).tolist(),
-            saved.get("running", running),
-        )
-    rng = mi.PCG32(size=count, initstate=seed * 7919 + 13)
-    adam_colour, adam_metallic, adam_slope = (
-        Adam(dr.width(p)) for p in (material.colour, material.metallic, material.slope)
-    )
-    adam_slope.floor = options.slope_calm
-    adam_c, adam_g = Adam(model.coefficients.size), Adam(model.gains.size)
-    adam_s = Adam(3)
-    adam = {"colour": adam_colour, "metallic": adam_metallic, "slope": adam_slope}
-    adam |= {"coefficients": adam_c, "gains": adam_g, "scale": adam_s}
-    recall(saved, rng, adam)
-    ratio = mi.Float(
-        np.tile(
-            np.array([1, 1, 1, options.roughness_rate / options.colour_rate], np.float32),
-            material.size**2,
-        )
-    )
-    lights = PhotoLights(dr.exp(mi.Float(model.lights().ravel())), views)
-    level = mi.Float(
-        begun.astype(np.float32).ravel()
-    )  # what arrives on average: for what blocks a direction
-    exposure = mi.Float(begun.mean(1).astype(np.float32))
+@dataclass
+class PhotoLightSample:
+    """What a step of `PhotoLightTerms` draws. near: neighbours for the priors. of: the light of
+    each direction. drawn: see `sample_lights`. each: the data term of each point, set by the
+    loss, as `a` and `b`, the two estimates, and `weight`, the posterior of its photo."""
 
-    broad = (
-        None
-        if frozen or first >= light.broad * options.steps
-        else BroadSteps(mesh.mesh, options.texture)
-    )
-    if broad is not None and saved and "broad" in saved:
-        broad.shown, broad.predicted = saved["broad"]
-    window = max(5, round(light.window * options.steps))
+    batch: Any
+    points: Points
+    near: Points
+    smooth_n: Any
+    of: Any
+    drawn: Any
+    shift: Any
+    each: Any = None
+    a: Any = None
+    b: Any = None
+    weight: Any = None
 
-    def step(i: int) -> dict:
-        nonlocal running
-        decay = cosine_decay(i / options.steps, 0.05)
-        warm = min(1.0, 0.05 + (i / (options.warm * options.steps)) ** 2)
-        batch, points = drawn_points(bank, mesh, rng, count)
+
+class PhotoLightTerms:
+    """Metallic-roughness textures under one light per photo, for `run_surface`.
+
+    frozen: only lights move (held-out photos).
+    """
+
+    def __init__(
+        self,
+        bank: PixelBank,
+        mesh: TraceableMesh,
+        model: CollectionSurface,
+        options: SurfaceOptions,
+        light: LightOptions,
+        frozen: bool = False,
+    ):
+        self.bank, self.mesh, self.model = bank, mesh, model
+        self.options, self.light, self.frozen = options, light, frozen
+        self.even = mean_level(model.family)
+        # (V, 3) light of each photo as the pass begins, which the mesh's own colours go with
+        begun = np.exp(model.gains) * self.even
+        self.level = mi.Float(begun.astype(np.float32).ravel())  # on average, for what blocks
+        self.exposure = mi.Float(begun.mean(1).astype(np.float32))
+        self.running = np.zeros(bank.views)  # running mean of each photo's loss
+        self.leaf: Any = mi.Float(model.lights().ravel())
+        self.lights = PhotoLights(dr.exp(self.leaf), bank.views)
+        self.schedule = MaterialSchedule(options, options.steps)
+        self.adam = {
+            "coefficients": Adam(model.coefficients.size),
+            "gains": Adam(model.gains.size),
+            "scale": Adam(3),
+        }
+        self.broad = None if frozen else BroadSteps(mesh.mesh, options.texture)
+        self.window = max(5, round(light.window * options.steps))
+
+    def variables(self) -> list[Variable]:
+        lights = Variable("lights", self, "leaf", kept=False)
+        material = [] if self.frozen else self.schedule.variables(self.model.material)
+        return [lights, *material]
+
+    def optimisers(self) -> dict[str, Adam]:
+        return self.adam
+
+    def state(self) -> dict[str, np.ndarray]:
+        model = self.model
+        kept = {name: getattr(model, name) for name in ("coefficients", "gains", "weights")}
+        if self.broad is not None:
+            kept["broad"] = np.stack([self.broad.shown, self.broad.predicted])
+        return {**kept, "losses": np.array(model.losses), "running": self.running}
+
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
+        model = self.model
+        for name in ("coefficients", "gains", "weights"):
+            setattr(model, name, saved[name])
+        model.losses = saved.get("losses", np.zeros(0)).tolist()
+        self.running = saved.get("running", self.running)
+        if self.broad is not None and "broad" in saved:
+            self.broad.shown, self.broad.predicted = saved["broad"]
+        self._follow_lights()
+
+    def _follow_lights(self) -> None:
+        self.lights.radiance = dr.exp(mi.Float(self.model.lights().ravel()))
+        dr.eval(self.lights.radiance)
+        self.lights.rebuild()
+
+    def begin(self, i: int, rng: Any) -> PhotoLightSample:
+        o, mesh, material = self.options, self.mesh, self.model.material
+        batch, points = drawn_points(self.bank, mesh, rng, o.points)
         valid = points.valid
         dr.eval(batch.view)
-        near = neighbour_points(mesh, points, options.similarity_reach, rng)
+        near = neighbour_points(mesh, points, o.similarity_reach, rng)
         dr.eval(near, rng)
-        shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (count - 1))
-        of = lights.of(dr.repeat(batch.view, options.directions))
+        shift = dr.opaque(mi.UInt32, 1 + (i * 7919) % (o.points - 1))
+        of = self.lights.of(dr.repeat(batch.view, o.directions))
         with dr.suspend_grad():
             start = material_at(material, points.uv, valid)
             smooth_n = points.n
             points.n = bent_normal(points, slope_at(material, points.uv, valid))
             dr.eval(start.base, start.roughness, start.metallic, points.n)
-        drawn = sample_lights(mesh, points, start, of, options.directions, rng)
-        drawn.blocked = drawn.blocked * dr.gather(
-            mi.Color3f, level, of.light
-        )  # what blocks is lit by the same photo's light
+        drawn = sample_lights(mesh, points, start, of, o.directions, rng)
+        # what blocks is lit by the same photo's light
+        drawn.blocked = drawn.blocked * dr.gather(mi.Color3f, self.level, of.light)
         dr.eval(drawn.blocked)
+        self.leaf = mi.Float(self.model.lights().ravel())
+        return PhotoLightSample(batch, points, near, smooth_n, of, drawn, shift)
 
-        leaf = mi.Float(model.lights().ravel())
-        params = [leaf] if frozen else [leaf, material.colour, material.metallic, material.slope]
-        dr.enable_grad(*params)
-        lights.radiance = dr.exp(leaf)
+    def loss(self, i: int, sample: PhotoLightSample) -> tuple[Any, Any]:
+        points, batch, material = sample.points, sample.batch, self.model.material
+        valid = points.valid
+        self.lights.radiance = dr.exp(self.leaf)
         surface = material_at(material, points.uv, valid)
-        points.n = smooth_n
+        points.n = sample.smooth_n
         slope = slope_at(material, points.uv, valid)
         points.n = bent_normal(points, slope)
-        a, b = reflected(points, drawn, surface, of)
-        heard = np.maximum(model.weights, LEAST).astype(np.float32)
-        weight = dr.gather(mi.Float, mi.Float(heard), batch.view)
-        each = dual_values(a, b, batch.rgb, saturated_at(bank, batch.view))
-        fit = weighted_mean(each, dr.select(valid, weight, 0))
-        loss = fit
-        if not frozen:
-            smoothing = dr.opaque(mi.Float, options.smooth_colour)
-            scale = common_scale(surface, valid, options.scale_power)
-            loss = loss + material_prior(material, surface, near, valid, scale, options, smoothing)
-            if options.parsimony > 0:
-                loss = loss + parsimony(material, surface, points.uv, valid, scale, shift, options)
-            loss = loss + options.slope_small * dr.mean(dr.select(valid, dr.squared_norm(slope), 0))
-            if light.anchor > 0:
-                pull = dr.opaque(
-                    mi.Float, light.anchor * 0.1 ** (i / (light.lambda_a * options.steps))
-                )
-                away = surface.base - batch.rgb / dr.gather(mi.Float, exposure, batch.view)
-                loss = loss + pull * dr.mean(dr.select(valid, dr.squared_norm(away), 0))
-        dr.backward(loss)
-        gradients = [dr.grad(p) for p in params]
-        dr.disable_grad(*params)
-        dr.eval(gradients, fit, each)
-        if not frozen:
-            material.colour = adam_colour.step(
-                dr.detach(material.colour), gradients[1], options.colour_rate * decay * warm, ratio
-            )
-            material.metallic = adam_metallic.step(
-                dr.detach(material.metallic), gradients[2], options.metallic_rate * decay
-            )
-            slope_rate = options.slope_rate * decay * (i >= options.slope_begin * options.steps)
-            material.slope = adam_slope.step(dr.detach(material.slope), gradients[3], slope_rate)
+        sample.a, sample.b = reflected(points, sample.drawn, surface, sample.of)
+        sample.weight = dr.gather(mi.Float, mi.Float(self._trust()), batch.view)
+        saturated = saturated_at(self.bank, batch.view)
+        sample.each = dual_values(sample.a, sample.b, batch.rgb, saturated)
+        fit = weighted_mean(sample.each, dr.select(valid, sample.weight, 0))
+        return fit, fit if self.frozen else fit + self._prior(i, sample, surface, slope)
+
+    def _trust(self) -> np.ndarray:
+        """(V,) weight of each photo's residuals."""
+        return np.maximum(self.model.weights, LEAST).astype(np.float32)
+
+    def _prior(self, i: int, sample: PhotoLightSample, surface: Any, slope: Any) -> Any:
+        o, light, material = self.options, self.light, self.model.material
+        points, valid, batch = sample.points, sample.points.valid, sample.batch
+        smoothing = dr.opaque(mi.Float, o.smooth_colour)
+        scale = common_scale(surface, valid, o.scale_power)
+        prior = material_prior(material, surface, sample.near, valid, scale, o, smoothing)
+        if o.parsimony > 0:
+            prior = prior + parsimony(material, surface, points.uv, valid, scale, sample.shift, o)
+        prior = prior + o.slope_small * dr.mean(dr.select(valid, dr.squared_norm(slope), 0))
+        if light.anchor > 0:
+            pull = dr.opaque(mi.Float, light.anchor * 0.1 ** (i / (light.lambda_a * o.steps)))
+            away = surface.base - batch.rgb / dr.gather(mi.Float, self.exposure, batch.view)
+            prior = prior + pull * dr.mean(dr.select(valid, dr.squared_norm(away), 0))
+        return prior
+
+    def finish(self, i: int, sample: PhotoLightSample, gradients: Mapping[str, Any]) -> None:
+        material = self.model.material
+        dr.eval(sample.each)
+        if not self.frozen:
             project(material)
             dr.eval(material.colour, material.metallic, material.slope)
-        g = (
-            np.array(gradients[0]).reshape(views, TEXELS * 3) / heard[:, None]
-        )  # the scaling is the material's, not the lights'
-        gc = (
-            model.family.pull_back(model.coefficients, g) + light.prior / views * model.coefficients
-        )
+        self._move_lights(i, gradients)
+        if self.broad is not None and i < self.light.broad * self.options.steps:
+            self._broad_step(i, sample)
+        if self.light.posterior and not self.frozen:
+            self._weigh_photos(i, sample)
+
+    def _move_lights(self, i: int, gradients: Mapping[str, Any]) -> None:
+        model, o, light, views = self.model, self.options, self.light, self.bank.views
+        decay = cosine_decay(i / o.steps, 0.05)
+        # the scaling is the material's, not the lights'
+        g = np.array(gradients["lights"]).reshape(views, TEXELS * 3) / self._trust()[:, None]
+        gc = model.family.pull_back(model.coefficients, g)
+        gc = gc + light.prior / views * model.coefficients
         gg = g.reshape(views, TEXELS, 3).sum(1)
-        if not frozen:
-            chroma = model.gains + np.log(even)
+        if not self.frozen:
+            chroma = model.gains + np.log(self.even)
             chroma = chroma - chroma.mean(1, keepdims=True)
             gg = gg + light.neutral / views * np.mean(chroma, 0)
         rate = light.rate * decay
-        if not frozen and options.exchange_rate > 0:
-            move = exchange_scale(adam_s, material, gradients[1], gg, options.exchange_rate * decay)
+        if not self.frozen and o.exchange_rate > 0:
+            pull, rate_of_scale = gradients["colour"], o.exchange_rate * decay
+            move = exchange_scale(self.adam["scale"], model.material, pull, gg, rate_of_scale)
             model.gains = model.gains + move
-        moves = frozen or i >= light.still * options.steps
-        c = adam_c.step(
-            mi.Float(model.coefficients.ravel()),
-            mi.Float(gc.astype(np.float32).ravel()),
-            2 * rate if moves else 0.0,
+        moves = self.frozen or i >= light.still * o.steps
+        flat = lambda x: mi.Float(np.asarray(x, np.float32).ravel())  # noqa: E731
+        c = self.adam["coefficients"].step(
+            flat(model.coefficients), flat(gc), 2 * rate if moves else 0.0
         )
-        k = adam_g.step(
-            mi.Float(model.gains.ravel()), mi.Float(gg.astype(np.float32).ravel()), rate
-        )
+        k = self.adam["gains"].step(flat(model.gains), flat(gg), rate)
         dr.eval(c, k)
         model.coefficients, model.gains = (
             np.array(c).reshape(views, -1),
             np.array(k).reshape(views, 3),
         )
-        lights.radiance = dr.exp(mi.Float(model.lights().ravel()))
-        dr.eval(lights.radiance)
-        lights.rebuild()
-        if broad is not None and i < light.broad * options.steps:
-            broad.add(
-                points.uv, display_weight(batch.rgb) * dr.select(valid, weight, 0), a, b, batch.rgb
-            )
-            if i % window == window - 1:
-                material.colour = material.colour * mi.Float(broad.factors().ravel())
-                project(material)
-                dr.eval(material.colour)
-        if light.posterior and not frozen:
-            running = _watch(
-                model,
-                np.array(each),
-                np.array(valid),
-                np.array(batch.view),
-                running,
-                i,
-                options.steps,
-            )
-        return {"colour": fit}
+        self._follow_lights()
 
-    def state() -> dict:
-        arrays = {
-            "colour": np.array(material.colour),
-            "metallic": np.array(material.metallic),
-            "slope": np.array(material.slope),
-        }
-        arrays |= {
-            "coefficients": model.coefficients,
-            "gains": model.gains,
-            "weights": model.weights,
-        }
-        arrays |= {} if broad is None else {"broad": np.stack([broad.shown, broad.predicted])}
-        return {**arrays, "losses": np.array(model.losses), "running": running, **memory(rng, adam)}
+    def _broad_step(self, i: int, sample: PhotoLightSample) -> None:
+        broad, material, valid = self.broad, self.model.material, sample.points.valid
+        assert broad is not None
+        rgb = sample.batch.rgb
+        weight = display_weight(rgb) * dr.select(valid, sample.weight, 0)
+        broad.add(sample.points.uv, weight, sample.a, sample.b, rgb)
+        if i % self.window == self.window - 1:
+            material.colour = material.colour * mi.Float(broad.factors().ravel())
+            project(material)
+            dr.eval(material.colour)
 
-    def textures(uv, valid):
-        at = material_at(material, uv, valid)
+    def _weigh_photos(self, i: int, sample: PhotoLightSample) -> None:
+        """Follow each photo's loss, put it into the ring buffer, set the weights once the lights
+        have settled."""
+        model = self.model
+        valid, view = np.array(sample.points.valid), np.array(sample.batch.view)
+        sums = np.bincount(view[valid], np.array(sample.each)[valid], len(model.weights))
+        counts = np.bincount(view[valid], minlength=len(model.weights))
+        seen, mean = counts > 0, sums / np.maximum(counts, 1)
+        followed = np.where(self.running == 0, mean, 0.95 * self.running + 0.05 * mean)
+        self.running = np.where(seen, followed, self.running)
+        model.losses = [*model.losses, *self.running[seen].tolist()][-HISTORY:]
+        if i > 0.15 * self.options.steps:
+            model.weights = posterior(self.running, model.losses)
+
+    def textures(self, uv: Any, valid: Any) -> list[Any]:
+        at = material_at(self.model.material, uv, valid)
         return [at.base, at.roughness]
 
-    run_steps(
-        stage, first, options.steps, step, state, preview=surface_preview(bank, mesh, textures)
-    )
-    return model
+
+def fit_collection_surface(terms: PhotoLightTerms, stage: Any, seed: int = 0) -> CollectionSurface:
+    """Run the pass; returns the model of the terms, optimised. Resumes from the stage's
+    checkpoint."""
+    rng = mi.PCG32(size=terms.options.points, initstate=seed * 7919 + 13)
+    run_surface(terms, terms.options.steps, rng, stage)
+    return terms.model
 
 
 def exchange_scale(
@@ -356,17 +376,3 @@ def exchange_scale(
     project(material)
     dr.eval(material.colour)
     return move.astype(np.float32)
-
-
-def _watch(model: CollectionSurface, each, valid, view, running, i: int, steps: int) -> np.ndarray:
-    """Follow each photo's loss, put it into the ring buffer, set the weights once the lights have
-    settled. Returns the running means."""
-    sums = np.bincount(view[valid], each[valid], len(model.weights))
-    counts = np.bincount(view[valid], minlength=len(model.weights))
-    seen = counts > 0
-    mean = sums / np.maximum(counts, 1)
-    running = np.where(seen, np.where(running == 0, mean, 0.95 * running + 0.05 * mean), running)
-    model.losses = [*model.losses, *running[seen].tolist()][-HISTORY:]
-    if i > 0.15 * steps:
-        model.weights = posterior(running, model.losses)
-    return running

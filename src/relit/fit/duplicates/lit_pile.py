@@ -10,8 +10,8 @@ import numpy as np
 from relit.conventions import similarity
 from relit.fit.duplicates.options import DuplicatesOptions
 from relit.fit.duplicates.scene import alone_bank, photo_bank, scene_mesh, spread_moves
+from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.pixels import PixelBank
-from relit.fit.passes.surface import SurfaceOptions
 from relit.fit.registration.instances.views import ANOTHER_PHOTO
 from relit.geometry.mesh import vertex_areas
 from relit.rendering.transport import TraceableMesh

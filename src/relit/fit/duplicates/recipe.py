@@ -44,7 +44,8 @@ from relit.fit.duplicates.scene import ground_colour, ground_reflectance, light_
 from relit.fit.duplicates.shape import shape_stages
 from relit.fit.duplicates.vessels import body_axis
 from relit.fit.passes.first_material import PAINT, first_material
-from relit.fit.passes.surface import ALBEDO_START, fit_surface, start_surface
+from relit.fit.passes.material_priors import ALBEDO_START
+from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
 from relit.fit.registration.instances.views import ANOTHER_PHOTO, InstanceView
 from relit.fit.shape.inpaint import painted_over
 from relit.fit.shape.unseen import seen_faces
@@ -164,7 +165,7 @@ def surface_stage(
             gathered = HiddenLight(
                 traced, hidden_from(traced, lit.cameras), traced.mesh.uvs[:, 0] < NO_TEXELS
             ).before
-        fit_surface(bank, traced, model, o, stage, seed, gathered)
+        fit_surface(EnvironmentTerms(bank, traced, model, o, seed, gathered), stage)
         names = ("base_color", "roughness", "metallic")
         paint = {
             n: fill_gutters(t, known) for n, t in zip(names, pictures(model.material), strict=True)

@@ -17,16 +17,12 @@ import numpy as np
 from relit.fit.duplicates.lit_pile import LitPile
 from relit.fit.duplicates.vessels import End, body_axis, ends_of, hollowed, mouths
 from relit.fit.passes.first_material import TRIAL, fewer_points
+from relit.fit.passes.losses import dual_values
+from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import saturated_at
-from relit.fit.passes.surface import (
-    SurfaceModel,
-    SurfaceOptions,
-    drawn_points,
-    dual_values,
-    fit_surface,
-    start_surface,
-)
+from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.passes.surface_loop import drawn_points
 from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import rasterise_atlas
@@ -138,7 +134,10 @@ class TrialShape:
 
     def fit(self, o: SurfaceOptions, stage, seed: int) -> None:
         """A few steps of the surface pass, from one grey."""
-        fit_surface(self.pile.bank, self.pile.traced, self.model, fewer_points(o), stage, seed)
+        terms = EnvironmentTerms(
+            self.pile.bank, self.pile.traced, self.model, fewer_points(o), seed
+        )
+        fit_surface(terms, stage)
 
     def texels_of(self, faces: np.ndarray) -> np.ndarray:
         """(S, S) bool: texels of faces (F,) bool."""

@@ -31,7 +31,7 @@ from relit.fit.flash.ambient import find_ambient
 from relit.fit.flash.dino import DinoNetwork, network_file
 from relit.fit.flash.features import FlashView, capture_features, network_features
 from relit.fit.flash.lobe_clusters import start_kinship
-from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, fit_flash_surface
+from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, FlashTerms, fit_flash_surface
 from relit.fit.passes.held_out import score_held_out
 from relit.fit.passes.load_photos import load_pixels
 from relit.fit.passes.pixels import PixelBank
@@ -426,7 +426,7 @@ def surface_stage(
         )
         if ambient is not None:
             model.around = ambient.on_texels(texels["x"], texels["n"], known, coat)
-        fit_flash_surface(bank, cameras, traceable, model, o, stage, seed)
+        fit_flash_surface(FlashTerms(bank, cameras, traceable, model, o), stage, seed)
         maps = {
             name: fill_gutters(picture, known)
             for name, picture in plastic_pictures(model.field).items()

@@ -9,6 +9,7 @@ patches, and none over a texel that is brighter yet.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,11 +21,10 @@ import numpy as np
 from relit.conventions import srgb_from_linear
 from relit.fit.flash.lobe_clusters import Kinship, share_evidence
 from relit.fit.flash.patches import draw_patches, pyramid_loss, ssim_loss
-from relit.fit.passes.losses import display_weight
-from relit.fit.passes.optimiser import Adam, cosine_decay, memory, recall, run_steps
+from relit.fit.passes.losses import display_weight, dual_values
+from relit.fit.passes.optimiser import Adam, Variable, cosine_decay
 from relit.fit.passes.pixels import PixelBank, draw_pixels, saturated_at, well_exposed
-from relit.fit.passes.preview import surface_preview
-from relit.fit.passes.surface import drawn_points, dual_values, neighbour_points
+from relit.fit.passes.surface_loop import drawn_points, neighbour_points, run_surface
 from relit.lighting.flash import light_position
 from relit.materials.plastic_field import PlasticField, plastic_at, project_plastic
 from relit.materials.rough_plastic import Coat, Plastic, base_radiance
@@ -101,166 +101,238 @@ class FlashModel:
     around: Any = None
 
 
-def fit_flash_surface(
-    bank: PixelBank,
-    cameras,
-    mesh: TraceableMesh,
-    model: FlashModel,
-    options: FlashSurfaceOptions,
-    stage,
-    seed: int = 0,
-) -> FlashModel:
-    """Run the pass; returns the same model, optimised. Resumes from the stage's checkpoint when
-    there is one."""
-    field, o = model.field, options
-    even = calm_weights(bank, cameras, o.edge)
-    beginning = PlasticField(field.size, mi.Float(field.diffuse), field.lobe, field.slope)
-    brightest = brightest_albedo(beginning)
-    first = 0
-    saved = stage.load("checkpoint")
-    if saved:
-        first = int(saved["step"])
-        field.diffuse, field.lobe, field.slope = (
-            mi.Float(saved[name]) for name in ("diffuse", "lobe", "slope")
-        )
-        model.offset, model.log_intensity = (
-            mi.Float(saved["offset"]),
-            mi.Float(saved["log_intensity"]),
-        )
-        if model.kinship is not None:
-            model.kinship.take_up(saved["level"], saved["sums"])
-    rng = mi.PCG32(size=o.points, initstate=seed * 7919 + 17)
-    adam = {
-        "diffuse": Adam(dr.width(field.diffuse)),
-        "slope": Adam(dr.width(field.slope), floor=o.slope_calm),
-    }
-    adam |= {
-        "lobe": Adam(dr.width(field.lobe), floor=o.lobe_calm),
-        "offset": Adam(3),
-        "log_intensity": Adam(1),
-    }
-    recall(saved, rng, adam)
-    ratio = mi.Float(
-        np.tile(np.array([o.specular_rate / o.alpha_rate, 1], np.float32), field.size**2)
-    )
+@dataclass
+class FlashSample:
+    """What a step of `FlashTerms` draws. near, close: neighbours for the priors of gloss and normal
+    map. calm: Float, see `calm_weights`. seen: Float, visibility of the flash. shading: what the
+    points are shaded with, set by the loss. sigma: see `robust_weight`."""
 
-    def step(i: int) -> dict:
-        decay = cosine_decay(i / o.steps, 0.03)
-        batch, points = drawn_points(
-            bank, mesh, rng, o.points, draw_patches if o.patches > 0 else draw_pixels
+    batch: Any
+    points: Points
+    near: Points
+    close: Points
+    calm: Any
+    seen: Any
+    shading: Shading | None = None
+    sigma: Any = None
+
+
+@dataclass(frozen=True)
+class Shading:
+    """plastic: material at the points. n: bent normals. position: of the flash for each point.
+    intensity: Float of width 1."""
+
+    plastic: Any
+    n: Any
+    position: Any
+    intensity: Any
+
+    def detached(self) -> Shading:
+        return Shading(
+            *(dr.detach(v) for v in (self.plastic, self.n, self.position, self.intensity))
         )
-        valid, calm = points.valid, dr.gather(mi.Float, even, batch.pixel)
+
+
+class FlashTerms:
+    """Rough-plastic textures under a flash beside the lens, for `run_surface`."""
+
+    def __init__(
+        self,
+        bank: PixelBank,
+        cameras,
+        mesh: TraceableMesh,
+        model: FlashModel,
+        options: FlashSurfaceOptions,
+    ):
+        self.bank, self.mesh, self.model, self.options = bank, mesh, model, options
+        self.even = calm_weights(bank, cameras, options.edge)
+        field = model.field
+        self.beginning = PlasticField(field.size, mi.Float(field.diffuse), field.lobe, field.slope)
+        self.brightest = brightest_albedo(self.beginning)
+        self.rng: Any = None
+
+    def decay(self, i: int) -> float:
+        return cosine_decay(i / self.options.steps, 0.03)
+
+    def variables(self) -> list[Variable]:
+        o, field, model, decay = self.options, self.model.field, self.model, self.decay
+        ratio = np.tile(np.array([o.specular_rate / o.alpha_rate, 1], np.float32), field.size**2)
+        begin = o.slope_begin * o.steps
+
+        def diffuse(i: int) -> float:  # the lobes settle first
+            return o.colour_rate * decay(i) * min(1.0, 10 * i / o.steps)
+
+        return [
+            Variable("diffuse", field, "diffuse", diffuse),
+            Variable(
+                "lobe",
+                field,
+                "lobe",
+                lambda i: o.alpha_rate * decay(i),
+                mi.Float(ratio),
+                floor=o.lobe_calm,
+            ),
+            Variable(
+                "slope",
+                field,
+                "slope",
+                lambda i: o.slope_rate * decay(i) * (i >= begin),
+                floor=o.slope_calm,
+            ),
+            Variable("offset", model, "offset", lambda i: o.offset_rate * decay(i)),
+            Variable(
+                "log_intensity", model, "log_intensity", lambda i: o.intensity_rate * decay(i)
+            ),
+        ]
+
+    def optimisers(self) -> dict[str, Adam]:
+        return {}
+
+    def state(self) -> dict[str, np.ndarray]:
+        kinship = self.model.kinship
+        if kinship is None:
+            return {}
+        return {"level": np.array(kinship.level), "sums": np.array(kinship.sums)}
+
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
+        if self.model.kinship is not None:
+            self.model.kinship.take_up(saved["level"], saved["sums"])
+
+    def begin(self, i: int, rng: Any) -> FlashSample:
+        o, bank, mesh = self.options, self.bank, self.mesh
+        self.rng = rng
+        draw = draw_patches if o.patches > 0 else draw_pixels
+        batch, points = drawn_points(bank, mesh, rng, o.points, draw)
+        valid, calm = points.valid, dr.gather(mi.Float, self.even, batch.pixel)
         dr.eval(batch.view, calm)
         near = neighbour_points(mesh, points, o.reach, rng)
         close = neighbour_points(mesh, points, o.slope_reach, rng)
         dr.eval(near, close, rng)
         with dr.suspend_grad():
-            flash = light_position(bank.cameras, batch.view, offset_of(model.offset))
+            flash = light_position(bank.cameras, batch.view, offset_of(self.model.offset))
             seen = lit(mesh, points, flash, valid) if o.shadow else dr.select(valid, mi.Float(1), 0)
             dr.eval(seen)
-        params = {"diffuse": field.diffuse, "lobe": field.lobe, "slope": field.slope}
-        params |= {"offset": model.offset, "log_intensity": model.log_intensity}
-        dr.enable_grad(*params.values())
-        position = light_position(bank.cameras, batch.view, offset_of(model.offset))
+        return FlashSample(batch, points, near, close, calm, seen)
+
+    def loss(self, i: int, sample: FlashSample) -> tuple[Any, Any]:
+        o, model, points, batch = self.options, self.model, sample.points, sample.batch
+        valid = points.valid
+        position = light_position(self.bank.cameras, batch.view, offset_of(model.offset))
         intensity = dr.exp(dr.gather(mi.Float, model.log_intensity, mi.UInt32(0)))
-        plastic, slope = plastic_at(field, points.uv, valid)
-        n = bent_normal(points, slope)
-        straight = direct(points, plastic, model.coat, n, position, intensity, seen)
+        plastic, slope = plastic_at(model.field, points.uv, valid)
+        shading = Shading(plastic, bent_normal(points, slope), position, intensity)
+        sample.shading = shading
+        straight = self._direct(sample, shading)
         a = b = straight
-        expected = straight + expected_bounce(model, points, plastic, n, batch.view, intensity)
+        expected = straight + expected_bounce(
+            model, points, plastic, shading.n, batch.view, intensity
+        )
         if o.directions > 0:
-            a, b = (
-                straight
-                + bounced(mesh, field, model, points, plastic, n, position, intensity, rng, o)
-                for _ in range(2)
-            )
+            a, b = (straight + self._bounced(points, shading) for _ in range(2))
         e = min(1.5 * i / o.steps, 1.0)
-        sigma = dr.opaque(mi.Float, o.robust[0] ** (1 - e) * o.robust[1] ** e)
-        saturated = saturated_at(bank, batch.view)
-        trust = calm * robust_weight(dr.detach(expected) - batch.rgb, batch.rgb, sigma)
+        sample.sigma = dr.opaque(mi.Float, o.robust[0] ** (1 - e) * o.robust[1] ** e)
+        saturated = saturated_at(self.bank, batch.view)
+        residual = dr.detach(expected) - batch.rgb
+        trust = sample.calm * robust_weight(residual, batch.rgb, sample.sigma)
         fit = paired_loss(a, b, batch.rgb, valid, trust, saturated)
         if o.patches > 0:
             counts = valid & well_exposed(batch.rgb, saturated)
-            alike = pyramid_loss(a, b, batch.rgb, dr.select(counts, calm, 0)) + ssim_loss(
-                a, b, batch.rgb, counts
-            )
+            alike = pyramid_loss(a, b, batch.rgb, dr.select(counts, sample.calm, 0))
+            alike = alike + ssim_loss(a, b, batch.rgb, counts)
             fit += dr.opaque(mi.Float, o.patches) * alike
         bend = slope.x * points.t + slope.y * points.b
-        prior = gloss_prior(model, plastic, points, near, valid, o) + flash_slope_prior(
-            field, bend, close, valid, o
-        )
+        prior = gloss_prior(model, plastic, points, sample.near, valid, o)
+        prior = prior + flash_slope_prior(model.field, bend, sample.close, valid, o)
         offset_z = dr.abs(dr.gather(mi.Float, model.offset, mi.UInt32(2)))
-        dr.backward(fit + prior + o.offset_z * offset_z)
-        gradients = {name: dr.grad(p) for name, p in params.items()}
-        dr.disable_grad(*params.values())
-        dr.eval(gradients, fit)
-        colour_rate = o.colour_rate * decay * min(1.0, 10 * i / o.steps)  # the lobes settle first
-        field.diffuse = adam["diffuse"].step(
-            dr.detach(field.diffuse), gradients["diffuse"], colour_rate
-        )
-        field.lobe = adam["lobe"].step(
-            dr.detach(field.lobe), gradients["lobe"], o.alpha_rate * decay, ratio
-        )
-        slope_rate = o.slope_rate * decay * (i >= o.slope_begin * o.steps)
-        field.slope = adam["slope"].step(dr.detach(field.slope), gradients["slope"], slope_rate)
-        model.offset = adam["offset"].step(
-            dr.detach(model.offset), gradients["offset"], o.offset_rate * decay
-        )
-        model.log_intensity = adam["log_intensity"].step(
-            dr.detach(model.log_intensity), gradients["log_intensity"], o.intensity_rate * decay
-        )
+        return fit, fit + prior + o.offset_z * offset_z
+
+    def finish(self, i: int, sample: FlashSample, gradients: Mapping[str, Any]) -> None:
+        o, model, field = self.options, self.model, self.model.field
         if model.kinship is not None:
             with dr.suspend_grad():
                 common = model.kinship.spread(model.kinship.level)
-                keep = 1 - (1 - model.kinship.own(o.own)) * dr.opaque(mi.Float, decay)
+                decay = dr.opaque(mi.Float, self.decay(i))
+                keep = 1 - (1 - model.kinship.own(o.own)) * decay
                 field.lobe = common + keep * (field.lobe - common)
                 if i % (o.share_every if 20 * i > o.steps else 2) == 0:
-                    share(points, batch, plastic, n, position, intensity, seen, calm, sigma, decay)
+                    self._share(i, sample)
         if i % RESCALE == RESCALE - 1:
-            rescale(model, brightest)
+            rescale(model, self.brightest)
         project_plastic(field)
         dr.eval(model.offset, model.log_intensity, field.diffuse, field.lobe, field.slope)
-        return {"colour": fit}
 
-    def share(points, batch, plastic, n, position, intensity, seen, calm, sigma, decay):
-        n, position, intensity, plastic = (dr.detach(v) for v in (n, position, intensity, plastic))
+    def _direct(self, sample: FlashSample, shading: Shading, plastic: Any = None) -> Any:
+        """Radiance by the flash alone (Color3f). plastic: in the place of the shading's own."""
+        return direct(
+            sample.points,
+            shading.plastic if plastic is None else plastic,
+            self.model.coat,
+            shading.n,
+            shading.position,
+            shading.intensity,
+            sample.seen,
+        )
+
+    def _bounced(self, points: Points, shading: Shading) -> Any:
+        """Mean of `directions` estimates of the inter-reflected light."""
+        o, model, total = self.options, self.model, mi.Color3f(0)
+        for _ in range(o.directions):
+            total += indirect(
+                self.mesh,
+                model.field,
+                model.coat,
+                points,
+                shading.plastic,
+                shading.n,
+                shading.position,
+                shading.intensity,
+                self.rng,
+                o.bounces,
+                o.shadow,
+            )
+        return total / o.directions
+
+    def _share(self, i: int, sample: FlashSample) -> None:
+        """A step of the common lobes of like places, by the evidence of this sample."""
+        o, model, batch, points = self.options, self.model, sample.batch, sample.points
+        assert sample.shading is not None
+        shading = sample.shading.detached()
         photo = mi.Color3f(batch.rgb)
         for _ in range(BOUNCE_SAMPLES if o.directions > 0 else 0):
-            photo -= (
-                bounced(mesh, field, model, points, plastic, n, position, intensity, rng, o)
-                / BOUNCE_SAMPLES
-            )
-            dr.eval(photo, rng)
-        now = direct(points, plastic, model.coat, n, position, intensity, seen)
-        now += expected_bounce(model, points, plastic, n, batch.view, intensity)
-        counts = points.valid & well_exposed(batch.rgb, saturated_at(bank, batch.view))
-        weight = display_weight(batch.rgb) * dr.select(
-            counts, calm * robust_weight(now - batch.rgb, batch.rgb, sigma), 0
+            photo -= self._bounced(points, shading) / BOUNCE_SAMPLES
+            dr.eval(photo, self.rng)
+        now = self._direct(sample, shading)
+        now += expected_bounce(
+            model, points, shading.plastic, shading.n, batch.view, shading.intensity
         )
-        dr.eval(n, position, intensity, photo, weight, plastic)
-        shade = lambda p: direct(points, p, model.coat, n, position, intensity, seen)  # noqa: E731
-        told, _ = plastic_at(beginning, points.uv, points.valid)
-        plastic = Plastic(told.diffuse, plastic.specular, plastic.alpha)
+        counts = points.valid & well_exposed(batch.rgb, saturated_at(self.bank, batch.view))
+        trust = sample.calm * robust_weight(now - batch.rgb, batch.rgb, sample.sigma)
+        weight = display_weight(batch.rgb) * dr.select(counts, trust, 0)
+        dr.eval(shading.n, shading.position, shading.intensity, photo, weight, shading.plastic)
+        first, _ = plastic_at(self.beginning, points.uv, points.valid)
+        plastic = Plastic(first.diffuse, shading.plastic.specular, shading.plastic.alpha)
         share_evidence(
-            model.kinship, field, points.uv, plastic, shade, photo, weight, o.share * decay
+            model.kinship,
+            model.field,
+            points.uv,
+            plastic,
+            lambda p: self._direct(sample, shading, p),
+            photo,
+            weight,
+            o.share * self.decay(i),
         )
 
-    def state() -> dict:
-        values = {"diffuse": field.diffuse, "lobe": field.lobe, "slope": field.slope}
-        values |= {"offset": model.offset, "log_intensity": model.log_intensity}
-        values |= (
-            {"level": model.kinship.level, "sums": model.kinship.sums}
-            if model.kinship is not None
-            else {}
-        )
-        return {name: np.array(value) for name, value in values.items()} | memory(rng, adam)
-
-    def textures(uv, valid):
-        at, _ = plastic_at(field, uv, valid)
+    def textures(self, uv: Any, valid: Any) -> list[Any]:
+        at, _ = plastic_at(self.model.field, uv, valid)
         return [at.diffuse, at.specular, at.alpha]
 
-    run_steps(stage, first, o.steps, step, state, preview=surface_preview(bank, mesh, textures))
-    return model
+
+def fit_flash_surface(terms: FlashTerms, stage: Any, seed: int = 0) -> FlashModel:
+    """Run the pass; returns the model of the terms, optimised. Resumes from the stage's checkpoint
+    where there is one."""
+    rng = mi.PCG32(size=terms.options.points, initstate=seed * 7919 + 17)
+    run_surface(terms, terms.options.steps, rng, stage)
+    return terms.model
 
 
 def brightest_albedo(field: PlasticField) -> float:
@@ -287,28 +359,6 @@ def rescale(model: FlashModel, brightest: float) -> None:
 def offset_of(flat):
     """Float [3] -> Vector3f of width 1."""
     return mi.Vector3f(*[dr.gather(mi.Float, flat, mi.UInt32(k)) for k in range(3)])
-
-
-def bounced(
-    mesh, field, model, points, plastic, n, position, intensity, rng, o: FlashSurfaceOptions
-):
-    """Mean of `directions` estimates of the inter-reflected light."""
-    total = mi.Color3f(0)
-    for _ in range(o.directions):
-        total += indirect(
-            mesh,
-            field,
-            model.coat,
-            points,
-            plastic,
-            n,
-            position,
-            intensity,
-            rng,
-            o.bounces,
-            o.shadow,
-        )
-    return total / o.directions
 
 
 def calm_weights(bank: PixelBank, cameras, edge: float):

@@ -28,8 +28,9 @@ from relit.fit.passes.explore import explore, first_shape
 from relit.fit.passes.first_material import PAINT, describe, first_material
 from relit.fit.passes.held_out import score_held_out
 from relit.fit.passes.load_photos import load_pixels
+from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.pixels import PixelBank, corrected, place_cameras
-from relit.fit.passes.surface import SurfaceOptions, fit_surface, start_surface
+from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.fit.shape.hollows import without
 from relit.fit.shape.inpaint import painted_over
@@ -379,7 +380,7 @@ def surface_stage(
             )
             run.say(describe(metallic, roughness, known))
         model = start_surface(start, known, mean, o, normals, metallic, roughness)
-        fit_surface(bank, traced, model, o, stage, seed)
+        fit_surface(EnvironmentTerms(bank, traced, model, o, seed), stage)
         base, roughness, metallic = pictures(model.material)
         paint = {"base_color": base, "roughness": roughness, "metallic": metallic}
         paint = painted_over(

@@ -20,16 +20,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
+from relit.fit.passes.losses import dual_values
+from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import PixelBank, saturated_at
-from relit.fit.passes.surface import (
-    SurfaceModel,
-    SurfaceOptions,
-    drawn_points,
-    dual_values,
-    fit_surface,
-    start_surface,
-)
+from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.passes.surface_loop import drawn_points
 from relit.materials.field import material_at
 from relit.rendering.transport import TraceableMesh, reflected, sample_lights
 
@@ -108,7 +104,7 @@ def first_material(
             None if normals is None else small[2],
             metallic,
         )
-        fit_surface(bank, mesh, model, fewer_points(o), stage, seed)
+        fit_surface(EnvironmentTerms(bank, mesh, model, fewer_points(o), seed), stage)
         return errors(bank, mesh, model, o, centres, colour, seed)
 
     paint, metal = errors_from(SIDES[0]), errors_from(SIDES[1])

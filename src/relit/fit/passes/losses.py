@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from relit.fit.passes.pixels import SATURATED
+
 
 def display_weight(target, eps: float = 0.02):
     """Weight of a squared difference of radiance that makes it nearly one of display values: (L* +
@@ -45,3 +47,18 @@ def normal_loss(normal, prior, weight):
 def weighted_mean(value, weight):
     """Σ w v / Σ w."""
     return dr.sum(value * weight) / dr.maximum(dr.sum(mi.Float(weight)), 1e-6)
+
+
+def dual_loss(a, b, target, valid, saturated=SATURATED):
+    """Mean of `dual_values` over valid points."""
+    return weighted_mean(dual_values(a, b, target, saturated), dr.select(valid, mi.Float(1), 0))
+
+
+def dual_values(a, b, target, saturated=SATURATED):
+    """display_weight (a - L*)(b - L*), mean over channels (Float); a and b are independent
+    estimates of L, so this is unbiased for the squared error. A pixel from `saturated` (float or
+    Float) on only says "at least this bright"."""
+    value = (a - target) * (b - target) * display_weight(target)
+    mean = dr.detach((a + b) * 0.5)
+    value = dr.select((target >= saturated) & (mean > target), 0, value)
+    return (value.x + value.y + value.z) / 3

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -39,6 +40,50 @@ class Adam:
         out = parameter - size * ratio * self.m / (dr.sqrt(second * correction) + 1e-12)
         dr.schedule(out, self.m, self.v)
         return out
+
+
+@dataclass
+class Variable:
+    """One array that a fit optimises: where its value is, how fast it moves.
+
+    The value is the attribute `attribute` of `owner` (Float). rate: step -> largest move of an
+    entry; None where the owner moves it by other means than Adam, and only its gradient is wanted.
+    ratio: factor on the rate, 1 or Float, entry by entry. floor: see `Adam`. until: step from which
+    on it stays fixed, None for never. kept: whether a checkpoint holds it.
+    """
+
+    name: str
+    owner: Any
+    attribute: str
+    rate: Callable[[int], float] | None = None
+    ratio: Any = 1.0
+    floor: float = 0.0
+    until: int | None = None
+    kept: bool = True
+    adam: Adam | None = field(init=False, default=None)
+
+    def __post_init__(self):
+        if self.rate is not None:
+            self.adam = Adam(dr.width(self.value), floor=self.floor)
+
+    @property
+    def value(self):
+        return getattr(self.owner, self.attribute)
+
+    def moves(self, i: int) -> bool:
+        """Whether it is optimised in step i."""
+        return self.until is None or i < self.until
+
+    def step(self, i: int, gradient) -> None:
+        """Take Adam's step i, where it is Adam that moves the value."""
+        if self.adam is not None and self.rate is not None:
+            new = self.adam.step(dr.detach(self.value), gradient, self.rate(i), self.ratio)
+            setattr(self.owner, self.attribute, new)
+
+    def restore(self, saved: Mapping[str, np.ndarray]) -> None:
+        """Take the value from a checkpoint."""
+        if self.kept:
+            setattr(self.owner, self.attribute, mi.Float(saved[self.name]))
 
 
 def memory(rng, adam: dict[str, Adam]) -> dict[str, np.ndarray]:
