@@ -1,26 +1,22 @@
-"""Photos of one object from anywhere -> a relightable asset. The recipe of the `collection` capture
-(SAMURAI, Boss et al. 2022).
+"""Photos of one object from anywhere -> a relightable asset.
 
-    photos       decode, masks (given, or guessed by GrabCut from the middle), focal length from
-                 EXIF or a guess
-    links        groups of photos whose features match
-    cameras/links.py, fit/collection/links.py
-    poses        coarse models and registration by rendering, in turns, from quadrants or one
-    silhouette    fit/registration/photos/poses.py
-    volume       signed distance field, one small light per photo, cameras and focal lengths free
-    fit/collection/shape.py second_look  photos that were put in a wrong place are searched for in
-    the finished shape, and told by fine detail
-                                                                          fit/collection/held_out.py, fit/registration/fine_detail.py
-    hollows      what no silhouette shows, the space under a seat: asked of every flat face
-    fit/shape/lids.py
-    opened       where there is such a space, the finer levels of the volume pass again, from the
-                 opened shape
+The recipe of the `collection` capture (SAMURAI, Boss et al. 2022). Stages:
+
+    photos       decode; masks, given or by GrabCut; focal lengths by EXIF or a guess: photos.py
+    links        groups of photos whose features match: cameras/links.py, links.py
+    poses        coarse models and registration by rendering, in turns, from quadrants or from one
+                 silhouette: registration/photos/poses.py
+    volume       signed distance field, one small light per photo, cameras and focal lengths free:
+                 shape.py
+    second_look  photos in wrong places are registered again against the finished shape, and
+                 verified by fine detail: held_out.py, registration/fine_detail.py
+    hollows      test for space under flat faces that no silhouette shows: fit/shape/lids.py
+    opened       with such a space, the finer levels of the volume pass again
     mesh         zero level set, decimated; texture atlas
-    surface      metallic-roughness textures, one environment per photo
-    fit/collection/surface.py
-    held_out     camera and light of photos that were set aside, with the model frozen
+    surface      metallic-roughness textures, one environment per photo: surface.py
+    held_out     camera and light of photos that were set aside, with the model frozen: held_out.py
 
-Frame of the result: the object's own, in which quadrants are said: +x right, +y up, +z to the
+The result is in the object's own frame, in which quadrants are given: +x right, +y up, +z to the
 front; the object sphere has radius 1.
 """
 

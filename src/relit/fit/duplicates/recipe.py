@@ -1,28 +1,26 @@
-"""Photos of several identical objects under an unknown light -> the object, its poses, its
-material, the light. The recipe of `duplicates`.
+"""Photos of several identical objects under an unknown light -> object, poses, material and light.
 
-    poses     a virtual camera for each instance; matching, and search by rendering
-    fit/duplicates/poses.py, fit/registration/instances/search.py
-    photos    of several photos of one pile how they stand to each other
-    fit/duplicates/photo_motions.py
-    joint     one signed distance field in the object's frame, moves with the poses; odd ones are
-    left out    fit/duplicates/pose_passes.py
-              who was not placed, and is found in their model, takes part in more
-              fit/duplicates/recover_unregistered.py
-    vessel    ends of a body of revolution: cut off square, and hollow where light says so
-    fit/duplicates/vessels.py, fit/duplicates/vessel_trial.py
-    volume    the same once more, from those poses; who was left out is sought in it
-    fit/duplicates/recover_unregistered.py, fit/registration/instances/azimuth.py
-    mesh       zero level set, decimated; mesh and poses as outlines and textures are; texture
-    atlas; the ground      fit/shape/alignment.py
-    surface    one material for all instances and one environment, light traced past all instances
-    and the ground     fit/passes/surface.py
-    turns      about the axis of a body of revolution, where they were guessed: as the photo shows
-    them       fit/duplicates/azimuth_refinement.py
-    asset      object, instances, ground and light in the frame of the user's camera
+The recipe of the `duplicates` capture (SfD, Cheng et al. 2023). Stages:
+
+    poses    a virtual camera for each instance; matching, and search by rendering: poses.py,
+             registration/instances/search.py
+    photos   of several photos of one pile, the motions between them: photo_motions.py
+    joint    one signed distance field in the object's frame, moved together with the poses;
+             outliers are left out, unregistered instances recovered: pose_passes.py,
+             recover_unregistered.py
+    vessel   ends of a body of revolution: cut off square, and hollow where light shows it:
+             vessels.py, vessel_trial.py
+    volume   the same pass again from those poses: shape.py
+    mesh     zero level set, decimated; mesh and poses aligned by outlines and textures; texture
+             atlas; the ground: fit/shape/alignment.py
+    surface  one material for all instances and one environment, light traced past all instances
+             and the ground: fit/passes/surface.py
+    turns    guessed azimuths of a body of revolution, compared with the photo:
+             azimuth_refinement.py
+    asset    object, instances, ground and light in the frame of the user's camera
 
 SfD Sec. 3: ξ_obj_i = ξ_ref ∘ (ξ_cam_i)^-1. With one photo ξ_ref is the photo's camera, so instance
-i stands at world_from_camera (object_from_camera_i)^-1.
+i has the pose world_from_camera (object_from_camera_i)^-1.
 """
 
 from __future__ import annotations

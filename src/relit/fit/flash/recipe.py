@@ -1,20 +1,20 @@
-"""Photos in a dark room under the camera's own flash -> shape, rough plastic and the flash itself.
-The recipe of the `flash` capture.
+"""Photos in a dark room under the camera's own flash -> shape, rough plastic and the flash.
 
-    photos     decode, carry the cameras to the unit frame
-    hull       visual hull of the masks, opened where the photos contradict it
-    fit/shape/hollows.py
-    volume     signed distance field by volume rendering, shaded by the flash at each rendered point
-    rendering/appearance/flash_light.py
-    mesh       zero level set, decimated; outlines as the masks have them; texture atlas; albedos of
-    each vertex     fit/shape/outlines.py
-    surface    rough-plastic textures, normal map and flash by exact direct light and estimated
-    inter-reflection   fit/flash/surface.py
-    asset      textures with filled gutters, everything back in the frame of the user's cameras
+The recipe of the `flash` capture: PIR (Bao et al. 2024), with voxels and textures in place of its
+networks. Stages:
 
-PIR (Bao et al. 2024), with voxels and textures where the paper has networks. Intensity and albedos
-share a factor that direct light cannot
-settle: it is set so that the brightest diffuse albedo is BRIGHTEST.
+    photos    decode; cameras to the unit frame: passes/load_photos.py
+    hull      visual hull of the masks, opened where the photos contradict it: shape/hollows.py
+    volume    signed distance field, shaded by the flash at each rendered point:
+              rendering/appearance/flash_light.py
+    mesh      zero level set, decimated; outlines follow the masks; texture atlas; albedos of the
+              vertices: shape/outlines.py
+    surface   rough-plastic textures, normal map and flash by exact direct light and estimated
+              inter-reflection: flash/surface.py
+    asset     textures with filled gutters, in the frame of the user's cameras
+
+Direct light does not determine the common scale of intensity and albedos: it is set so that the
+99th percentile of the diffuse albedo is BRIGHTEST.
 """
 
 from __future__ import annotations

@@ -1,18 +1,16 @@
-"""Photos around an object under one fixed, unknown light -> a relightable asset. The recipe of the
-`multiview` capture.
+"""Photos around an object under one fixed, unknown light -> a relightable asset.
 
-photos     decode, carry the cameras to the unit frame (object sphere = unit sphere)
-hull       visual hull of the masks, or without masks the fused depths of a radiance field of the
-whole scene   fit/passes/explore.py
-volume     signed distance field and deferred appearance by volume rendering, coarse to fine
-fit/passes/volume.py
-mesh       zero level set, decimated; outlines as the masks have them, or without masks what the
-           photos see; texture atlas;
-           mean radiance per vertex
-           fit/shape/outlines.py, fit/shape/unseen.py
-surface    metallic-roughness textures and environment by Monte Carlo light transport
-fit/passes/first_material.py, fit/passes/surface.py
-asset      textures with filled gutters, everything back in the frame of the user's cameras
+The recipe of the `multiview` capture. Stages:
+
+    photos    decode; cameras to the unit frame (object sphere = unit sphere): passes/load_photos.py
+    hull      visual hull of the masks; without masks the fused depths of a radiance field of the
+              whole scene: passes/explore.py
+    volume    signed distance field and deferred appearance, coarse to fine: passes/volume.py
+    mesh      zero level set, decimated; outlines follow the masks, or without masks what the
+              photos see; texture atlas: shape/outlines.py, shape/unseen.py
+    surface   metallic-roughness textures and environment by Monte Carlo light transport:
+              passes/first_material.py, passes/surface.py
+    asset     textures with filled gutters, in the frame of the user's cameras
 """
 
 from __future__ import annotations

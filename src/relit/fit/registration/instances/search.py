@@ -1,23 +1,17 @@
-"""The search for poses of identical objects: guesses for pairs, growth from the best of them,
-rounds of fit and search.
+"""The search for poses of identical objects: guesses for pairs, growth, rounds of fit and search.
 
-place_revolved bodies of revolution, by their outlines and their decoration
-(fit/registration/instances/revolution_search.py); all others go on as follows
-pair_guesses   every instance's silhouette is inflated to a crude model, and every other one
-               registered against it (fit/registration/instances/guesses.py)
-borne_out      what matching has linked, as far as silhouettes and paint bear it out
-               (fit/registration/instances/links.py)
-grow           one instance after another joins those that stand already
-               (fit/registration/instances/growth.py); from several pairs, the best counts
-up_to_turns    where instances were not sure of their places: those turned that the silhouettes ask
-               for, if the object nearly looks like
-               itself when it is turned (fit/registration/instances/near_symmetry_search.py)
-improved       where they are not yet sure: taken out and grown again, another way each time
-               (fit/registration/instances/regrowth.py); once, where most
-               of a growth was sure, before it starts from another pair
-settled        rounds of a coarse model of all and a search for all poses by rendering it, descents,
-               doubt (fit/registration/instances/rounds.py)
-coherent_turns as up_to_turns, of the poses that have come out
+place_revolved  bodies of revolution, by their outlines and decoration: revolution_search.py;
+                all other objects go through the following
+pair_guesses    the silhouette of each instance is inflated to a crude model, and every other
+                instance registered against it: guesses.py
+verified_links  what matching has linked, as far as silhouettes and colours agree: links.py
+grow_instances  one instance after another joins the registered ones; from several pairs, of
+                which the best counts: growth.py
+up_to_turns     contested instances are turned where silhouettes call for it, if the object is
+                nearly symmetric: near_symmetry_search.py
+improved        contested instances are taken out and grown again: regrowth.py
+refine_and_verify  rounds of a coarse model of all and a search by rendering it: rounds.py
+coherent_turns  as up_to_turns, of the final poses
 """
 
 from __future__ import annotations
