@@ -8,7 +8,7 @@ that agrees best with all registered instances.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -91,114 +91,58 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
 }
 
 
-def evaluate_duplicates(
-    run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0
-) -> dict[str, Any]:
-    """Every figure that the truth allows, as `evaluate.dispatch.evaluate`. Raises UserError where
-    the truth is unfinished."""
-    from relit.asset.asset import load_asset, read_bounded_json
-    from relit.images import read_data
-    from relit.reference.mitsuba_scene import build_scene, render, render_channels
-    from relit.reference.pile import build_pile
+@dataclass(frozen=True)
+class PileTruth:
+    """What `relit synthesize duplicates` wrote. content: of truth.json. cameras: of the test views,
+    by name. photo: the camera of the photo. poses: label -> world_from_object (4, 4)."""
 
-    folder, asset = Path(truth_folder), load_asset(run)
+    folder: Path
+    content: dict[str, Any]
+    cameras: list[tuple[str, Camera]]
+    photo: Camera
+    poses: dict[int, np.ndarray]
+
+    def picture(self, name: str) -> np.ndarray:
+        """A linear picture below truth/."""
+        from relit.images import read_data
+
+        return read_data(self.folder / "truth" / f"{name}.exr")
+
+
+def pile_truth(folder: Path) -> PileTruth:
+    """The truth of a rendered pile. Raises UserError where its rendering was stopped."""
+    from relit.asset.asset import read_bounded_json
+
     if not (folder / "truth" / "truth.json").is_file():
         raise UserError(
             "the folder holds no complete truth",
             "its rendering was stopped",
             f"make it again: {folder}",
         )
-    truth = read_bounded_json(folder / "truth" / "truth.json")
-    cameras = read_transforms(folder / "transforms_test.json")
-    photo = read_transforms(folder / "transforms_train.json")[0][1]
-    true_poses = {i["label"]: np.array(i["world_from_object"]) for i in truth["instances"]}
-    poses = {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
-    values = instance_pose_figures(
-        poses, true_poses, {i["label"]: i["visible"] for i in truth["instances"]}
+    content = read_bounded_json(folder / "truth" / "truth.json")
+    return PileTruth(
+        folder,
+        content,
+        read_transforms(folder / "transforms_test.json"),
+        read_transforms(folder / "transforms_train.json")[0][1],
+        {i["label"]: np.array(i["world_from_object"]) for i in content["instances"]},
     )
-    before = poses_before(Path(run), photo, list(poses))
-    if len(before) == len(poses):
-        earlier = instance_pose_figures(before, true_poses, {})
-        values["rotation_before"], values["pairs_before"] = (
-            earlier["rotation_median"],
-            earlier["rotation_pairs"],
-        )
 
-    import trimesh
 
-    loaded = trimesh.load(folder / "truth" / "mesh.ply", process=False)
-    true_points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).points
-    scale, own_middle, frame = scene_alignment(
-        poses, true_poses, photo, true_points, asset.mesh.vertices
-    )
-    radius, depth = truth["radius"], truth["settings"]["max_depth"]
-    values["translation_median"] = (
-        centre_error(poses, true_poses, photo, scale, own_middle, true_points) / radius
-    )
-    values["surface_median"] = (
-        add_s(poses, true_poses, photo, scale, frame, true_points[:: SAMPLES // 2000]) / radius
-    )
-    own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
-    values["chamfer"] = sample_chamfer(true_points, own, frame)
+def evaluate_duplicates(
+    run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0
+) -> dict[str, Any]:
+    """Every figure that the truth allows, as `evaluate.dispatch.evaluate`. Raises UserError where
+    the truth is unfinished."""
+    from relit.asset.asset import load_asset
 
-    moved = [grown_about(photo.centre, scale) @ p for p in poses.values()]
-    ground = None if asset.ground is None else scaled_ground(asset.ground, photo.centre, scale)
-    per_view: dict[str, dict[str, float]] = {name: {} for name, _ in cameras}
-
-    def scene_under(material, light):
-        pile = build_pile(asset.mesh, material, moved, ground)
-        return build_scene(pile.mesh, pile.material, np.eye(4), light)
-
-    scene = scene_under(asset.material, asset.environment)
-    objects = build_pile(asset.mesh, asset.material, moved)
-    bare = build_scene(
-        objects.mesh, objects.material, np.eye(4), None
-    )  # channels of the objects alone
-    predicted, reference = {}, {}
-    for name, camera in cameras:
-        predicted[name] = render_channels(bare, camera, spp=16)
-        reference[name] = read_data(folder / "truth" / "test" / f"{name}_albedo.exr")
-    inside = {name: r[..., 3] >= m.MASK for name, r in reference.items()}
-    both = {name: inside[name] & (predicted[name]["alpha"] > 0) for name in inside}
-    factor = m.albedo_scale(
-        np.concatenate([predicted[n]["albedo"][both[n]] for n in both]),
-        np.concatenate([reference[n][..., :3][both[n]] for n in both]),
-    )
-    for i, (name, camera) in enumerate(cameras):
-        p, where = predicted[name], inside[name]
-        for key in ("roughness", "metallic"):
-            t = read_data(folder / "truth" / "test" / f"{name}_{key}.exr")
-            per_view[name][f"{key}_mse"] = float(np.square(p[key] - t)[where].mean())
-        per_view[name]["albedo_psnr"] = m.psnr(
-            m.encode(p["albedo"] * factor), m.encode(reference[name][..., :3]), where
-        )
-        picture = read_data(folder / "truth" / "test" / f"{name}.exr")
-        shown = (
-            render(scene, camera, spp=spp, seed=seed + i, max_depth=depth)[..., :3]
-            * (p["alpha"] > 0)[..., None]
-        )
-        per_view[name]["novel_psnr"] = m.psnr(m.encode(shown), m.encode(picture[..., :3]), where)
-    scaled = replace(
-        asset.material,
-        base_color=np.clip(asset.material.base_color * factor, 0, 1).astype(np.float32),
-    )
-    for light_name in truth["relight"]:
-        scene = scene_under(
-            scaled, read_data(folder / "truth" / "relight" / f"{light_name}.exr")[..., :3]
-        )
-        for i, (name, camera) in enumerate(cameras):
-            picture = read_data(folder / "truth" / "relight" / light_name / f"{name}.exr")
-            shown = (
-                render(scene, camera, spp=spp, seed=seed + i, max_depth=depth)[..., :3]
-                * (predicted[name]["alpha"] > 0)[..., None]
-            )
-            per_view[name][f"relit_psnr:{light_name}"] = m.psnr(
-                m.encode(shown), m.encode(picture[..., :3]), inside[name]
-            )
-    light = read_data(folder / "truth" / "environment.exr")[..., :3]
+    asset, truth = load_asset(run), pile_truth(Path(truth_folder))
+    values, scale = _pose_and_shape_figures(Path(run), asset, truth)
+    per_view, factor = _view_figures(asset, truth, scale, spp, seed)
+    light = truth.picture("environment")[..., :3]
     values["environment_mse"] = m.environment_mse(asset.environment, light)
     values["environment_mse_scaled"] = m.environment_mse(asset.environment / factor, light)
-    values["photo_psnr"] = photo_figure(asset, folder, spp=spp, seed=seed)
+    values["photo_psnr"] = photo_figure(asset, truth.folder, spp=spp, seed=seed)
     values |= view_means(per_view)
     return {
         "metrics": entries(values, DUPLICATES_DEFINITIONS),
@@ -206,6 +150,96 @@ def evaluate_duplicates(
         "albedo_scale": [float(x) for x in factor],
         "alignment": "scale about the camera",
     }
+
+
+def registered_poses(asset: Asset) -> dict[int, np.ndarray]:
+    """label -> world_from_object (4, 4) of the registered instances."""
+    return {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
+
+
+def _pose_and_shape_figures(
+    run: Path, asset: Asset, truth: PileTruth
+) -> tuple[dict[str, float], float]:
+    """Figures of poses and shape, and the scale about the photo's camera that aligns the pile."""
+    import trimesh
+
+    poses, photo, radius = registered_poses(asset), truth.photo, truth.content["radius"]
+    visible = {i["label"]: i["visible"] for i in truth.content["instances"]}
+    values = instance_pose_figures(poses, truth.poses, visible)
+    before = poses_before(run, photo, list(poses))
+    if len(before) == len(poses):
+        earlier = instance_pose_figures(before, truth.poses, {})
+        values["rotation_before"] = earlier["rotation_median"]
+        values["pairs_before"] = earlier["rotation_pairs"]
+    loaded = trimesh.load(truth.folder / "truth" / "mesh.ply", process=False)
+    points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).points
+    scale, own_middle, frame = scene_alignment(
+        poses, truth.poses, photo, points, asset.mesh.vertices
+    )
+    centres = centre_error(poses, truth.poses, photo, scale, own_middle, points)
+    values["translation_median"] = centres / radius
+    some = points[:: SAMPLES // 2000]
+    values["surface_median"] = add_s(poses, truth.poses, photo, scale, frame, some) / radius
+    own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
+    values["chamfer"] = sample_chamfer(points, own, frame)
+    return values, scale
+
+
+def _view_figures(
+    asset: Asset, truth: PileTruth, scale: float, spp: int, seed: int
+) -> tuple[dict[str, dict[str, float]], np.ndarray]:
+    """Figures of each test view, and the scale of base colour (3,) that they use."""
+    from relit.reference.mitsuba_scene import build_scene, render, render_channels
+    from relit.reference.pile import build_pile
+
+    centre, cameras = truth.photo.centre, truth.cameras
+    moved = [grown_about(centre, scale) @ p for p in registered_poses(asset).values()]
+    ground = None if asset.ground is None else scaled_ground(asset.ground, centre, scale)
+    objects = build_pile(asset.mesh, asset.material, moved)
+    # channels of the objects alone
+    bare = build_scene(objects.mesh, objects.material, np.eye(4), None)
+    predicted = {name: render_channels(bare, camera, spp=16) for name, camera in cameras}
+    reference = {name: truth.picture(f"test/{name}_albedo") for name, _ in cameras}
+    inside = {name: r[..., 3] >= m.MASK for name, r in reference.items()}
+    both = {name: inside[name] & (predicted[name]["alpha"] > 0) for name in inside}
+    factor = m.albedo_scale(
+        np.concatenate([predicted[n]["albedo"][both[n]] for n in both]),
+        np.concatenate([reference[n][..., :3][both[n]] for n in both]),
+    )
+
+    def under(material, light, pictures: str) -> dict[str, float]:
+        """PSNR of each view inside the mask, against truth/`pictures`."""
+        pile = build_pile(asset.mesh, material, moved, ground)
+        scene = build_scene(pile.mesh, pile.material, np.eye(4), light)
+        depth, out = truth.content["settings"]["max_depth"], {}
+        for i, (name, camera) in enumerate(cameras):
+            shown = render(scene, camera, spp=spp, seed=seed + i, max_depth=depth)[..., :3]
+            shown = shown * (predicted[name]["alpha"] > 0)[..., None]
+            picture = truth.picture(f"{pictures}/{name}")[..., :3]
+            out[name] = m.psnr(m.encode(shown), m.encode(picture), inside[name])
+        return out
+
+    novel = under(asset.material, asset.environment, "test")
+    per_view: dict[str, dict[str, float]] = {}
+    for name, _ in cameras:
+        p, where = predicted[name], inside[name]
+        true_albedo = m.encode(reference[name][..., :3])
+        per_view[name] = {
+            f"{key}_mse": float(
+                np.square(p[key] - truth.picture(f"test/{name}_{key}"))[where].mean()
+            )
+            for key in ("roughness", "metallic")
+        }
+        albedo = m.encode(p["albedo"] * factor)
+        per_view[name]["albedo_psnr"] = m.psnr(albedo, true_albedo, where)
+        per_view[name]["novel_psnr"] = novel[name]
+    base = np.clip(asset.material.base_color * factor, 0, 1).astype(np.float32)
+    for light in truth.content["relight"]:
+        radiance = truth.picture(f"relight/{light}")[..., :3]
+        relit = under(replace(asset.material, base_color=base), radiance, f"relight/{light}")
+        for name, value in relit.items():
+            per_view[name][f"relit_psnr:{light}"] = value
+    return per_view, factor
 
 
 def evaluate_on_photo(
