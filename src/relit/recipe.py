@@ -46,3 +46,12 @@ class Recipe:
     min_photos: int = 3
     object_cost: ObjectCost | None = None
     ablations: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+@dataclass(frozen=True)
+class FitContext:
+    """What every stage of a recipe needs. options: of the recipe."""
+
+    run: Run
+    options: Any
+    seed: int

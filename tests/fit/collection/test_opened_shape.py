@@ -12,6 +12,7 @@ from relit.fit.collection.options import CollectionOptions
 from relit.fit.shape.lids import open_lids
 from relit.geometry.hull import distance_of
 from relit.geometry.sdf import dense_values, resample
+from relit.recipe import FitContext
 from relit.run import Run
 from support.hollow_box import BOX, FIRST_SMALL, ROOM, THEN_SMALL, N, cameras, pictures
 
@@ -48,7 +49,9 @@ def shape_of(inside, folder, options=OPTIONS):
     shots = [SimpleNamespace(mask=m) for m in alpha]
     model = collection_shape.fresh_model(distance_of(BOX), tints)
     with Run.open(folder, {}) as run:
-        found = collection_shape.opened_stage(bank, shots, cameras(), model, tints, run, options, 0)
+        found = collection_shape.opened_stage(
+            bank, shots, cameras(), model, tints, FitContext(run, options, 0)
+        )
     return dense_values(model.grid), found
 
 

@@ -24,6 +24,7 @@ from relit.fit.registration.instances import outliers as odd
 from relit.geometry.sdf import node_positions
 from relit.geometry.se3 import exp_so3, rotation_angle
 from relit.images import write_linear
+from relit.recipe import FitContext
 from relit.run import Run
 from relit.synthesize.duplicates import RADIUS, heap, synthesize_duplicates
 from relit.synthesize.procedural import pawn
@@ -339,7 +340,7 @@ def told_passes(monkeypatch, asked: list, *told: dict):
     some = [SimpleNamespace(key=name) for name in "abcde"]
     say = SimpleNamespace(say=lambda text: asked.append(text))
     views, *rest = pose_passes.joint_stages(
-        some[:3], np.zeros((3, 4, 4)), some[3:], lambda left: left, say, None, 0
+        some[:3], np.zeros((3, 4, 4)), some[3:], lambda left: left, FitContext(say, None, 0)
     )
     return "".join(v.key for v in views), *rest
 

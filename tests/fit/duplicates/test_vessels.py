@@ -22,6 +22,7 @@ from relit.geometry.revolution_axis import Axis, revolution_axis
 from relit.geometry.sdf import node_positions
 from relit.geometry.se3 import look_at
 from relit.images import write_linear
+from relit.recipe import FitContext
 from relit.run import Run
 from relit.scene import Camera
 from relit.synthesize.duplicates import synthesize_duplicates
@@ -197,8 +198,8 @@ def asked(folder, profile, monkeypatch):
     with Run.open(folder / "run", {}) as run:
         with run.stage("joint", title="joint") as stage:
             stage.save("checkpoint", values=coned(scale))
-        found = shape.vessel_stage(shots, views, poses, None, run, options, 0)
-        again = shape.vessel_stage(shots, views, poses, None, run, options, 0)
+        found = shape.vessel_stage(shots, views, poses, None, FitContext(run, options, 0))
+        again = shape.vessel_stage(shots, views, poses, None, FitContext(run, options, 0))
     assert np.array_equal(found, again)
     return found, scale, (folder / "run" / "log.txt").read_text()
 

@@ -47,6 +47,7 @@ from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import rotation_angle
 from relit.lighting.per_photo import COLUMNS, ROWS
 from relit.materials.field import start_material
+from relit.recipe import FitContext
 from relit.rendering.appearance.light_per_photo import shade_photos, shade_plain, start_photo_lights
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
@@ -66,20 +67,11 @@ GAIN = 0.03
 
 
 def held_out_stage(
-    held,
-    shots,
-    model: VolumeModel,
-    mesh,
-    albedo,
-    maps,
-    cameras,
-    degrees,
-    run,
-    options: CollectionOptions,
-    seed: int,
+    held, shots, model: VolumeModel, mesh, albedo, maps, cameras, degrees, fit: FitContext
 ):
     """(cameras, lights (H, ROWS, COLUMNS, 3)) of the held-out photos: registered by rendering and
     by what the others (`shots`, their `cameras`) show, descended, lit; model and material stay."""
+    run, options, seed = fit.run, fit.options, fit.seed
     if not held:
         return [], np.zeros((0, ROWS, COLUMNS, 3), np.float32)
     if run.done("held_out"):

@@ -56,7 +56,7 @@ from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.per_photo import COLUMNS, ROWS
 from relit.materials.field import normal_map, pictures, start_material
-from relit.recipe import Recipe
+from relit.recipe import FitContext, Recipe
 from relit.rendering.appearance.fixed_light import features_at
 from relit.rendering.transport import TraceableMesh
 from relit.run import run_arrays
@@ -79,6 +79,7 @@ CHECKED = 12  # photos from which on the poses are checked by leaving out half o
 
 def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0) -> Asset:
     """Run all stages of the recipe in the run folder; stages that are done are read back."""
+    fit = FitContext(run, options, seed)
     check_levels(options)
     light_family(options)  # a network that cannot be read is said before anything is searched
     shots, held, degrees = load_shots(capture, options, run)
@@ -86,17 +87,13 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
     groups = [] if "links" in options.without else links_stage(shots, run, seed)
     shots = with_focals(shots, groups)
     cameras, weights, held_fast = pose_stage(shots, groups, degrees, run, options, seed)
-    bank, cameras, model = volume_stage(
-        shots, cameras, weights, held_fast, tints, run, options, seed
-    )
-    cameras = second_look_stage(bank, shots, cameras, model, degrees, held_fast, run, options, seed)
-    cameras = opened_stage(bank, shots, cameras, model, tints, run, options, seed)
+    bank, cameras, model = volume_stage(shots, cameras, weights, held_fast, tints, fit)
+    cameras = second_look_stage(bank, shots, cameras, model, degrees, held_fast, fit)
+    cameras = opened_stage(bank, shots, cameras, model, tints, fit)
     parts = mesh_stage(model, run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
-    maps = surface_stage(bank, cameras, mesh, parts["albedo"], tints, run, options, seed)
-    found = held_out_stage(
-        held, shots, model, mesh, parts["albedo"], maps, cameras, degrees, run, options, seed
-    )
+    maps = surface_stage(bank, cameras, mesh, parts["albedo"], tints, fit)
+    found = held_out_stage(held, shots, model, mesh, parts["albedo"], maps, cameras, degrees, fit)
     return assemble(
         shots + held,
         cameras + found[0],
@@ -227,18 +224,11 @@ def judge_poses(
 
 
 def second_look_stage(
-    bank: PixelBank,
-    shots,
-    cameras,
-    model: VolumeModel,
-    degrees,
-    linked,
-    run,
-    options: CollectionOptions,
-    seed: int,
+    bank: PixelBank, shots, cameras, model: VolumeModel, degrees, linked, fit: FitContext
 ):
     """The cameras, those of lost photos found anew (`linked` ones are not lost); `bank` gets them
     too."""
+    run, options, seed = fit.run, fit.options, fit.seed
     if "search" in options.without:
         return cameras
     if run.done("second_look"):
@@ -343,11 +333,12 @@ def surface_options(options: CollectionOptions) -> SurfaceOptions:
 
 
 def surface_stage(
-    bank: PixelBank, cameras, mesh: Mesh, albedo, tints, run, options: CollectionOptions, seed: int
+    bank: PixelBank, cameras, mesh: Mesh, albedo, tints, fit: FitContext
 ) -> dict[str, np.ndarray]:
     """Material and lights; what no photo shows is painted like what is next to it. Returns (and
     keeps) base_color, roughness, metallic, normal, lights (V, ROWS, COLUMNS, 3) in the unit
     frame."""
+    run, options, seed = fit.run, fit.options, fit.seed
     if run.done("surface"):
         return run_arrays(run, "surface", "maps")
     o = surface_options(options)

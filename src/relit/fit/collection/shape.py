@@ -27,6 +27,7 @@ from relit.fit.registration.photos.poses import GREY
 from relit.fit.shape.hollows import without
 from relit.fit.shape.lids import FIRST, PHOTOS, open_lids
 from relit.geometry.hull import NoShape, distance_of, visual_hull
+from relit.recipe import FitContext
 from relit.rendering.appearance.light_per_photo import shade_photos, start_photo_lights
 from relit.run import run_arrays
 from relit.scene import Camera
@@ -52,11 +53,10 @@ def fresh_model(values: np.ndarray, tints: np.ndarray) -> VolumeModel:
     return model
 
 
-def volume_stage(
-    shots, cameras, weights, linked, tints, run, options: CollectionOptions, seed: int
-):
+def volume_stage(shots, cameras, weights, linked, tints, fit: FitContext):
     """(pixel bank with the final cameras, cameras, model). Poses that come from matches move at a
     third of the others' rate."""
+    run, options, seed = fit.run, fit.options, fit.seed
     silhouettes = [s.mask for s in shots]
     bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], silhouettes), weights, seed)
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
@@ -88,18 +88,12 @@ def volume_stage(
 
 
 def opened_stage(
-    bank: PixelBank,
-    shots,
-    cameras: list[Camera],
-    model: VolumeModel,
-    tints,
-    run,
-    options: CollectionOptions,
-    seed: int,
+    bank: PixelBank, shots, cameras: list[Camera], model: VolumeModel, tints, fit: FitContext
 ):
     """The cameras after the finer levels of the volume pass, made again where a hollow was found
     that no silhouette shows; `model` is then the opened one, and `bank` gets the cameras. As they
     are where there is none."""
+    run, options, seed = fit.run, fit.options, fit.seed
     if options.hollows == 0 or len(shots) < PHOTOS:
         return cameras
     bank.corrections = dr.zeros(mi.Float, 7 * bank.views)

@@ -44,6 +44,7 @@ from relit.geometry.hull import NoShape
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import rotation_angle, turns_apart
+from relit.recipe import FitContext
 from relit.rendering.appearance.world_light import shade_world, start_world_light
 from relit.run import run_arrays
 from relit.scene import Mesh
@@ -164,9 +165,7 @@ def joint_stages(
     poses: np.ndarray,
     others: list[InstanceView],
     seek: Callable,
-    run,
-    options: DuplicatesOptions,
-    seed: int,
+    fit: FitContext,
 ):
     """(views, poses, odd (N,) bool, arrived: see `Pass`, the last pass) after a first volume pass,
     and others while textures say that poses are still on their way (at most PASSES): what each
@@ -175,6 +174,7 @@ def joint_stages(
     `others` whom the last pass finds (see `fit.duplicates.recover_unregistered.joiners`) take part in more, until poses
     have arrived again, and the rest is sought once more then; where those of before agree clearly
     less for it, all is as it was. seek: of those who are sought, and as Seek."""
+    run, options, seed = fit.run, fit.options, fit.seed
     views, poses, odd, last, arrived, ago = (
         list(views),
         poses.copy(),

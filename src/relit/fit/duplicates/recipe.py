@@ -51,7 +51,7 @@ from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.se3 import nearest_rotation, rotation_angle, rotation_from
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
-from relit.recipe import ObjectCost, Recipe
+from relit.recipe import FitContext, ObjectCost, Recipe
 from relit.rendering.transport import NO_TEXELS
 from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
@@ -60,6 +60,7 @@ from relit.settings import check_levels
 
 def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0) -> Asset:
     """Run all stages of the recipe in the run folder; stages that are done are read back."""
+    fit = FitContext(run, options, seed)
     check_levels(options)
     photos = labelled_photos(capture)
     # each photo's own frame: OpenCV axes, unit lengths of the object
@@ -86,13 +87,13 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
     else:
-        parts = shape_stages(shots, views, poses, others, on_axes, run, options, seed)
+        parts = shape_stages(shots, views, poses, others, on_axes, fit)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     camera = photos[0].camera
     maps = (
         run_arrays(run, "surface", "maps")
         if run.done("surface")
-        else surface_stage(shots, camera, mesh, parts, run, options, seed)
+        else surface_stage(shots, camera, mesh, parts, fit)
     )
     doubts = dict(zip(keys.tolist(), unsure.tolist(), strict=True))
     asset = assemble(photos, mesh, maps, parts, doubts)
@@ -128,11 +129,12 @@ def with_normals(pixels: Pixels, options: DuplicatesOptions) -> Pixels:
 
 
 def surface_stage(
-    shots, camera: Camera, mesh: Mesh, parts, run, options: DuplicatesOptions, seed: int
+    shots, camera: Camera, mesh: Mesh, parts, fit: FitContext
 ) -> dict[str, np.ndarray]:
     """Material and light, in the scene frame: the world's axes, unit lengths of the object, the
     origin in the middle of the pile. What no instance shows is painted like what is next to it.
     Returns (and keeps) base_color, roughness, metallic, normal, environment and ground_colour."""
+    run, options, seed = fit.run, fit.options, fit.seed
     o = pile_surface_options(options)
     with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
         up = camera.world_from_camera[:3, :3] @ parts["plane"][1] if len(parts["plane"]) else None

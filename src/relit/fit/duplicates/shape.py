@@ -37,6 +37,7 @@ from relit.fit.shape.loose_parts import without_loose_parts
 from relit.geometry.atlas import unwrap
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, redistance, resample, row_features
+from relit.recipe import FitContext
 from relit.rendering.appearance.world_light import instance_radiance
 from relit.run import run_arrays
 from relit.scene import Mesh
@@ -48,9 +49,7 @@ def shape_stages(
     poses: np.ndarray,
     others: list[InstanceView],
     on_axes: dict[int, np.ndarray],
-    run,
-    options: DuplicatesOptions,
-    seed: int,
+    fit: FitContext,
 ) -> dict[str, np.ndarray]:
     """Volume pass, mesh, ground. shots: the photos. others: views without poses; on_axes: by key,
     poses of such as are right up to a turn about the object's y axis. Returns (and keeps) vertices,
@@ -59,9 +58,8 @@ def shape_stages(
     4) first_from_photo and related (P,) bool; view_keys (N,) of what is shown by the related
     photos, and view_instances (N,) which of the instances it is; vague, keys of those whose turn
     about the axis is a guess."""
-    views, poses, model, follow, vague = volume_stage(
-        shots, views, poses, others, on_axes, run, options, seed
-    )
+    run, options = fit.run, fit.options
+    views, poses, model, follow, vague = volume_stage(shots, views, poses, others, on_axes, fit)
     rate = pose_rate(views, options)
     with run.stage("mesh", title="mesh, atlas, ground") as stage:
         mesh, views, poses, values, placed = placed_surface(
@@ -189,9 +187,7 @@ def volume_stage(
     poses: np.ndarray,
     others: list[InstanceView],
     on_axes: dict[int, np.ndarray],
-    run,
-    options: DuplicatesOptions,
-    seed: int,
+    fit: FitContext,
 ):
     """(views, poses, model, follow, vague) after the volume pass, from the poses of the first ones.
     Instances that do not agree with their model are left out; they, and `others`, which the search
@@ -199,13 +195,12 @@ def volume_stage(
     where outlines have them, `followed` or `placed_by_outlines`, or None where they stay. vague:
     (view, pose) of those whose axis alone is told, by `on_axes` (see `shape_stages`) or by the
     silhouette in the model."""
+    run, options, seed = fit.run, fit.options, fit.seed
     arrived, symmetry, vessel, follow, vague = False, None, None, None, []
     before = {v.key: p for v, p in zip(views, poses, strict=True)}
     if pose_rate(views, options) > 0:
         seek = partial(joiners, run=run, options=options, seed=seed)
-        views, poses, odd, arrived, last = joint_stages(
-            views, poses, others, seek, run, options, seed
-        )
+        views, poses, odd, arrived, last = joint_stages(views, poses, others, seek, fit)
         symmetry, follow = last.symmetry, followed
         # outlines and textures have had their say by the shape of the pass before; where they
         # agree, this one may follow both
@@ -217,7 +212,7 @@ def volume_stage(
             *(views[k] for k in np.flatnonzero(odd)),
         ]
         views, poses = [views[k] for k in np.flatnonzero(~odd)], poses[~odd]
-        vessel = vessel_stage(shots, views, poses, symmetry, run, options, seed)
+        vessel = vessel_stage(shots, views, poses, symmetry, fit)
     steps = sum(options.level_steps) if vessel is None else sum(options.level_steps[1:])
     with run.stage("volume", steps=steps, title="shape and poses (volume pass)") as stage:
         model, bank, poses = shape_and_poses(
@@ -237,13 +232,12 @@ def vessel_stage(
     views: list[InstanceView],
     poses: np.ndarray,
     symmetry: Symmetry | None,
-    run,
-    options: DuplicatesOptions,
-    seed: int,
+    fit: FitContext,
 ) -> np.ndarray | None:
     """Distances that the finer levels of the volume pass begin with, where the object is a body of
     revolution whose ends silhouettes do not show as they are (`fit.duplicates.vessel_trial.vessel_of`); None
     for others."""
+    run, options, seed = fit.run, fit.options, fit.seed
     if "vessels" in options.without or len(options.levels) < 2:
         return None
     if run.done("vessel"):

@@ -49,7 +49,7 @@ from relit.masks.threshold import Backdrop
 from relit.materials.plastic_as_gltf import base_colour
 from relit.materials.plastic_field import MOST_SPECULAR, plastic_pictures, start_plastic
 from relit.materials.rough_plastic import IOR, Coat
-from relit.recipe import Recipe
+from relit.recipe import FitContext, Recipe
 from relit.rendering.appearance.fixed_light import features_at
 from relit.rendering.appearance.flash_light import FlashAppearance, alpha_on, start_learnt
 from relit.rendering.transport import TraceableMesh
@@ -163,6 +163,7 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     has cameras and an object sphere."""
     if not capture.has_cameras or capture.sphere is None:
         raise ValueError("reconstruct needs cameras and the object sphere")
+    fit = FitContext(run, options, seed)
     check_levels(options)
     check_backdrop(capture)
     bank, cameras, masks, level = load_pixels(capture, options, run)
@@ -176,14 +177,14 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
     else:
-        model = volume_stage(bank, cameras, masks, level, coat, run, options, seed)
+        model = volume_stage(bank, cameras, masks, level, coat, fit)
         score_held_out(capture, model, run, np.eye(4))
         parts = mesh_stage(model, cameras, masks, [p.name for p in capture.photos], run, options)
     mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
     else:
-        maps = surface_stage(bank, cameras, mesh, parts, coat, run, options, seed)
+        maps = surface_stage(bank, cameras, mesh, parts, coat, fit)
     return assemble(capture, mesh, maps, options.ior)
 
 
@@ -243,17 +244,11 @@ def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarra
 
 
 def volume_stage(
-    bank: PixelBank,
-    cameras: list[Camera],
-    masks,
-    level,
-    coat: Coat,
-    run,
-    options: FlashOptions,
-    seed: int,
+    bank: PixelBank, cameras: list[Camera], masks, level, coat: Coat, fit: FitContext
 ) -> VolumeModel:
     """Visual hull, then the volume pass with the flash's shading. The model's `extra` holds the
     intensity."""
+    run, options, seed = fit.run, fit.options, fit.seed
     distance2 = float(np.median([c.centre @ c.centre for c in cameras]))
     intensity = np.pi * distance2 * float(level.mean()) / (START_ALBEDO * MEAN_COSINE)
     shadows = options.shadows and "shadow" not in options.without
@@ -371,11 +366,10 @@ def mesh_stage(
     return parts
 
 
-def surface_stage(
-    bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, run, options: FlashOptions, seed: int
-):
+def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, fit: FitContext):
     """Material and flash. Returns (and keeps) diffuse, specular, alpha, normal, offset and
     intensity (unit frame)."""
+    run, options, seed = fit.run, fit.options, fit.seed
     o = surface_options(options)
     network = DinoNetwork(network_file(options.dino)) if options.dino else None
     with run.stage("surface", steps=o.steps, title="material and flash (surface pass)") as stage:

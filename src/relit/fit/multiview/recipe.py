@@ -45,7 +45,7 @@ from relit.geometry.sdf import dense_values, row_features
 from relit.geometry.se3 import align_cameras, nearest_rotation
 from relit.materials.field import normal_map, pictures
 from relit.materials.intrinsic import base_without_shading
-from relit.recipe import Recipe
+from relit.recipe import FitContext, Recipe
 from relit.rendering.appearance.fixed_light import mean_radiance
 from relit.rendering.background import start_background
 from relit.rendering.transport import TraceableMesh
@@ -171,13 +171,14 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
     has cameras and an object sphere."""
     if not capture.has_cameras or capture.sphere is None:
         raise ValueError("reconstruct needs cameras and the object sphere")
+    fit = FitContext(run, options, seed)
     check_levels(options)
     bank, cameras, masks, level = load_pixels(capture, options, run)
 
     if run.done("mesh"):
         parts = run_arrays(run, "mesh", "mesh")
     else:
-        model = volume_stage(bank, cameras, masks, level, run, options, seed)
+        model = volume_stage(bank, cameras, masks, level, fit)
         score_held_out(capture, model, run, refined_cameras(cameras, run, options)[1])
         parts = mesh_stage(model, cameras, masks, [p.name for p in capture.photos], run, options)
     cameras, parts = follow_cameras(bank, cameras, parts, run, options)
@@ -186,7 +187,7 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
     if run.done("surface"):
         maps = run_arrays(run, "surface", "maps")
     else:
-        maps = surface_stage(bank, cameras, mesh, parts["radiance"], run, options, seed)
+        maps = surface_stage(bank, cameras, mesh, parts["radiance"], fit)
     poses = (
         [move_pose(capture.sphere.world_from_unit, c.world_from_camera) for c in cameras]
         if options.refine_cameras > 0
@@ -243,10 +244,11 @@ def follow_cameras(
 
 
 def volume_stage(
-    bank: PixelBank, cameras: list[Camera], masks, level, run, options: MultiviewOptions, seed: int
+    bank: PixelBank, cameras: list[Camera], masks, level, fit: FitContext
 ) -> VolumeModel:
     """Hull, or without masks a first shape from a radiance field of the whole scene; then the
     volume pass."""
+    run, options, seed = fit.run, fit.options, fit.seed
     if masks is None:
         field = start_background(options.background, level)
         with run.stage(
@@ -355,11 +357,12 @@ def mesh_stage(
 
 
 def surface_stage(
-    bank: PixelBank, cameras, mesh: Mesh, radiance, run, options: MultiviewOptions, seed: int
+    bank: PixelBank, cameras, mesh: Mesh, radiance, fit: FitContext
 ) -> dict[str, np.ndarray]:
     """Material and light. cameras: unit frame. What none of them sees is painted like what is next
     to it. Returns (and keeps) base_color, roughness, metallic, normal, environment (unit frame),
     f0."""
+    run, options, seed = fit.run, fit.options, fit.seed
     o = surface_options(options)
     with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
         face, bary = rasterise_atlas(mesh, o.texture)
