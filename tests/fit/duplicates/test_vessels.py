@@ -246,7 +246,7 @@ def test_the_second_end_is_asked_of_the_fit_with_the_first_hollow(monkeypatch):
             values.shape, f"{end} {raised}".startswith("mouth") * (1 + raised)
         ),
         "lid_of": lambda *_: None,
-        "met_by": lambda *_: vessel_trial.PIXELS,
+        "pixels_on_texels": lambda *_: vessel_trial.PIXELS,
         "change_of_error": change,
         "redistance": lambda values: values,
     }

@@ -328,7 +328,7 @@ def test_of_bodies_of_revolution_that_are_mostly_sure_the_others_are_left_to_the
     monkeypatch.setattr(
         instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
     )
-    for name in ("confirmed", "settled"):  # which could lose the axes
+    for name in ("confirmed", "refine_and_verify"):  # which could lose the axes
         monkeypatch.setattr(
             instance_search, name, lambda *a, **k: pytest.fail("a search over all poses")
         )

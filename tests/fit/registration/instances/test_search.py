@@ -361,7 +361,7 @@ def test_what_doubt_moves_is_kept_only_where_all_agree_no_worse(monkeypatch):
         asked.append(set(sure))
         return (sent, scores, [2]) if 2 not in sure else (poses, scores, [])
 
-    for name in ("settle", "descend", "regrown"):
+    for name in ("settle_instances", "refine_jointly", "regrown"):
         monkeypatch.setattr(
             instance_rounds, name, lambda v, c, r, poses, scores, *_, **__: (poses, scores)
         )

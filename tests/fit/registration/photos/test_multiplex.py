@@ -84,7 +84,12 @@ def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_search
     )
     shots = [SimpleNamespace(direction=np.zeros(3), camera=camera)]
     quiet = SimpleNamespace(say=lambda *_: None)
-    nothing = {"crops_of": [None], "crop_rings": None, "volume_render": None, "make_gallery": None}
+    nothing = {
+        "collection_crops": [None],
+        "crop_rings": None,
+        "volume_render": None,
+        "make_gallery": None,
+    }
 
     def search(crops, gallery, keep, **_):
         kept.append(keep)

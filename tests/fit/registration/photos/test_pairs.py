@@ -137,7 +137,7 @@ def test_a_set_grows_to_all_photos(monkeypatch):
 
     for name, stand_in in {
         "coarse_model": lambda *_: None,
-        "descended": lambda some, poses, *_: (SimpleNamespace(), poses),
+        "fit_with_free_poses": lambda some, poses, *_: (SimpleNamespace(), poses),
         "replace": lambda model, **_: model,
         "volume_render": lambda _: None,
         "make_gallery": lambda render, views, parts: SimpleNamespace(cameras=views),
