@@ -44,6 +44,20 @@ def load_scene(device) -> Callable[[Path], Any]:
     return load
 
 
+@pytest.fixture
+def report_sizes(monkeypatch) -> Callable[..., None]:
+    """Shrinks the pictures of the report; called with names of constants of report/page.py, it
+    changes those."""
+    from relit.report import page
+
+    def shrink(**sizes: int) -> None:
+        for name, value in sizes.items():
+            monkeypatch.setattr(page, name, value)
+
+    shrink(SIDE=24, STILLS=2, SPP=1, SPP_COMPARED=1, VIEWS=1, HELD_OUT=1)
+    return shrink
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """Folder with the third-party photos, models and environment maps; `RELIT_DATA` names another

@@ -51,13 +51,10 @@ def example(monkeypatch, capsys, number, *argv) -> str:
     return capsys.readouterr().out
 
 
-def test_examples_in_order(monkeypatch, capsys, folder):
+def test_examples_in_order(monkeypatch, capsys, folder, report_sizes):
     import relit.fit.multiview.recipe as multiview
-    from relit.report import page as report
 
     monkeypatch.setitem(multiview.PRESETS, "draft", TINY)
-    for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1}.items():
-        monkeypatch.setattr(report, name, value)
     run = folder / "run"
     assert "6 photos, read as transforms" in example(monkeypatch, capsys, 1, folder / "photos")
     said = example(monkeypatch, capsys, 2, folder / "photos", run)

@@ -18,7 +18,6 @@ from PIL import Image
 
 from relit.asset.asset import load_asset
 from relit.cli import main as cli
-from relit.report import page as report
 from relit.run import Run
 from support.commands import JOB, TINY, answered
 from support.small_captures import collection_photos, flash_photos
@@ -39,9 +38,8 @@ def capture(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def small_report(monkeypatch):
-    for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1}.items():
-        monkeypatch.setattr(report, name, value)
+def small_report(report_sizes):
+    """Every report of this file is small."""
 
 
 def start(*words, limits=()):

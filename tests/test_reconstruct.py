@@ -19,7 +19,6 @@ from relit.errors import UserError
 from relit.files import parse_toml
 from relit.job import Job, check_memory, estimate, open_input
 from relit.recipe import Recipe
-from relit.report import page as report
 from relit.scene import Asset
 from relit.synthesize.procedural import pawn, studio
 from support.striped_ball import picture, write_capture
@@ -28,12 +27,10 @@ CALLS: list[tuple] = []
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch):
+def quick(monkeypatch, report_sizes):
     """A fit of three steps that checkpoints each, and a small report."""
     import relit.fit.multiview.recipe as multiview
 
-    for name, value in {"SIDE": 24, "STILLS": 2, "SPP": 1, "SPP_COMPARED": 1, "VIEWS": 1}.items():
-        monkeypatch.setattr(report, name, value)
     CALLS.clear()
 
     def fit(capture, run, options, seed):

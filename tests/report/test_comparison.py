@@ -144,18 +144,10 @@ def made(request):
     )
 
 
-def test_what_the_report_draws_is_what_the_photos_show(made, tmp_path, monkeypatch):
+def test_what_the_report_draws_is_what_the_photos_show(made, tmp_path, report_sizes):
     kind, asset, capture = made
     assert kind_of(asset) == kind
-    for name, value in {
-        "SIDE": W,
-        "STILLS": 3,
-        "SPP": 2,
-        "SPP_COMPARED": SPP,
-        "VIEWS": 2,
-        "HELD_OUT": 1,
-    }.items():
-        monkeypatch.setattr(report, name, value)
+    report_sizes(SIDE=W, STILLS=3, SPP=2, SPP_COMPARED=SPP, VIEWS=2)
     save_asset(tmp_path / "asset", asset)
     text = report.write_report(tmp_path, capture).read_text()
     section = text.split("<h2>")[1]

@@ -25,16 +25,8 @@ EVIL = "<script>alert(1)</script>.png"
 
 
 @pytest.fixture(autouse=True)
-def small(monkeypatch):
-    for name, value in {
-        "SIDE": 40,
-        "STILLS": 3,
-        "SPP": 2,
-        "SPP_COMPARED": 2,
-        "VIEWS": 2,
-        "HELD_OUT": 1,
-    }.items():
-        monkeypatch.setattr(report, name, value)
+def small(report_sizes):
+    report_sizes(SIDE=40, STILLS=3, SPP=2, SPP_COMPARED=2, VIEWS=2)
 
 
 @pytest.fixture(scope="module")
@@ -131,9 +123,9 @@ def test_the_report_says_what_is_missing(folder):
     assert "Photos and renders" not in said
 
 
-def test_comparison_measures_where_the_object_is_drawn(asset, monkeypatch):
+def test_comparison_measures_where_the_object_is_drawn(asset, report_sizes):
     """Photos that are the report's own renders agree; grey ones do not."""
-    monkeypatch.setattr(report, "SPP_COMPARED", 32)
+    report_sizes(SPP_COMPARED=32)
     from relit.reference.mitsuba_scene import build_scene, render
 
     scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
