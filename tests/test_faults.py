@@ -336,4 +336,4 @@ def test_a_page_that_is_not_built(capsys, tmp_path, monkeypatch):
         got, _, err = relit(capsys, *words)
         answered(got, err, 5, "make viewer")
     got, _, err = relit(capsys, "view", tmp_path / "run", "--port", "99999")
-    answered(got, err, 2, "no port")
+    answered(got, err, 2, "is not a port")

@@ -239,7 +239,7 @@ def test_light_is_checked_before_a_flash_reconstruction(tmp_path, monkeypatch):
 def test_light_regime_of_the_mug(shared, tmp_path):
     from relit.reconstruction import reconstruct
 
-    with pytest.raises(UserError, match="taken from one place, under a light that moves"):
+    with pytest.raises(UserError, match="taken from one viewpoint, under a light that moves"):
         reconstruct(
             shared / "real" / "flash_mug",
             tmp_path / "run",

@@ -188,7 +188,7 @@ def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeyp
     number of them."""
     import drjit as dr
 
-    import relit.fit.passes.surface as surface
+    import relit.fit.passes.surface_loop as surface
     import relit.fit.passes.volume as volume
 
     seen, late = set(), []
