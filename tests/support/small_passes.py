@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -15,6 +14,7 @@ from relit.fit.collection.surface import (
 from relit.fit.flash.lobe_clusters import start_kinship
 from relit.fit.flash.recipe import rates_by_step
 from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, FlashTerms, fit_flash_surface
+from relit.fit.passes.camera_corrections import CorrectionModel, no_corrections
 from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
 from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
@@ -77,11 +77,11 @@ def collection_volume(shot, stage):
     """A light for each photo; cameras and focal lengths move. The poses' own descents and those of
     held-out photos are such fits too."""
     bank, *_ = shot
-    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
     model = ball_model()
     model.reflections, model.rates = start_photo_lights(np.full((bank.views, 3), 0.3), 0.3)
     model.appearance = shade_photos
-    model.extra["correction_rates"] = mi.Float(np.ones(7 * bank.views, np.float32))
+    model.correction_ratios = mi.Float(np.ones(7 * bank.views, np.float32))
     fit_volume(bank, model, VolumeOptions(**VOLUME, refine_cameras=0.003), stage)
 
 

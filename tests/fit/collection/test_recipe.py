@@ -164,7 +164,8 @@ def test_corrections_about_the_origin_are_rays_of_corrected_cameras(each):
     their derivative is right."""
     import drjit as dr
 
-    from relit.fit.passes.pixels import camera_rows, corrected, rays_through
+    from relit.fit.passes.camera_corrections import CameraCorrections, CorrectionModel, corrected
+    from relit.fit.passes.pixels import camera_rows, rays_through
     from relit.geometry.se3 import look_at
     from relit.scene import Camera
 
@@ -175,14 +176,15 @@ def test_corrections_about_the_origin_are_rays_of_corrected_cameras(each):
     numbers = np.random.default_rng(2).normal(size=2 * each) * 0.05
     view, x, y = mi.UInt32([0, 1, 1]), mi.Float([3.5, 10.5, 30.5]), mi.Float([20.5, 2.5, 15.5])
     rows = mi.Float(camera_rows(cameras))
-    o, d = rays_through(rows, view, x, y, mi.Float(numbers))
-    o2, d2 = rays_through(mi.Float(camera_rows(corrected(cameras, numbers))), view, x, y)
+    own = CameraCorrections(CorrectionModel(each), mi.Float(numbers))
+    o, d = rays_through(rows, view, x, y, own)
+    o2, d2 = rays_through(mi.Float(camera_rows(corrected(cameras, own))), view, x, y)
     assert np.allclose(np.array(o), np.array(o2), atol=1e-5) and np.allclose(
         np.array(d), np.array(d2), atol=1e-5
     )
 
     def value(c):
-        o, d = rays_through(rows, view, x, y, c)
+        o, d = rays_through(rows, view, x, y, CameraCorrections(own.model, c))
         return dr.sum(
             dr.dot(o, mi.Vector3f(0.3, -0.7, 0.2)) + dr.dot(d, mi.Vector3f(1.1, 0.4, -0.6))
         )

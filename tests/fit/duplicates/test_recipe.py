@@ -212,8 +212,8 @@ def test_poses_wait_for_the_coarse_level_and_distances_move_on_the_middle_one(
             begin_level(model)
             seen.append(
                 (
-                    np.array(bank.corrections).reshape(-1, 8),
-                    np.array(model.extra["correction_rates"]).reshape(-1, 8),
+                    bank.corrections.numbers,
+                    np.array(model.correction_ratios).reshape(-1, 8),
                 )
             )
 
@@ -234,7 +234,7 @@ def test_poses_wait_for_the_coarse_level_and_distances_move_on_the_middle_one(
         run.stage("volume", steps=18, title="volume") as stage,
     ):
         _, bank, _ = pose_passes.shape_and_poses(views, poses, run, stage, options, 0)
-    last = np.array(bank.corrections).reshape(-1, 8)
+    last = bank.corrections.numbers
     (coarse, rates), (middle, then) = seen
     assert (
         not coarse.any() and middle[:, :3].any() and middle[:, 7].any()

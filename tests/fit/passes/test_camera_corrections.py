@@ -6,8 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from relit.fit.passes.camera_corrections import without_common_motion
-from relit.fit.passes.pixels import camera_rows, corrected
+from relit.fit.passes.camera_corrections import (
+    CameraCorrections,
+    CorrectionModel,
+    corrected,
+    without_common_motion,
+)
+from relit.fit.passes.pixels import camera_rows
 from relit.geometry.se3 import exp_so3, look_at
 from relit.scene import Camera
 
@@ -35,6 +40,18 @@ def between(cameras):
     return np.array(out)
 
 
+def corrections_of(numbers):
+    """Of (views, 6, 7 or 8) numbers."""
+    model = CorrectionModel(np.shape(numbers)[1])
+    return CameraCorrections(model, mi.Float(np.ravel(numbers).astype(np.float32)))
+
+
+def freed(numbers, cameras):
+    """The numbers without what the cameras share."""
+    rows = mi.Float(camera_rows(cameras))
+    return without_common_motion(corrections_of(numbers), rows).numbers
+
+
 def common(cameras, each, turn, growth, shift):
     """Corrections that turn, grow and move all cameras together, to first order."""
     rows = []
@@ -56,14 +73,12 @@ def test_a_common_motion_is_taken_out_whole(each):
         cameras, each, np.array([2e-3, -1e-3, 3e-3]), 4e-3, np.array([5e-3, 1e-3, -2e-3])
     )
     assert (
-        np.abs(np.diff(between(corrected(cameras, moved.ravel())) - between(cameras), axis=0)).max()
+        np.abs(
+            np.diff(between(corrected(cameras, corrections_of(moved))) - between(cameras), axis=0)
+        ).max()
         < 1e-4
     )  # the corrections are common
-    left = np.array(
-        without_common_motion(
-            mi.Float(moved.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))
-        )
-    )
+    left = freed(moved, cameras)
     assert np.abs(left).max() < 2e-2 * np.abs(moved).max()
 
 
@@ -72,20 +87,12 @@ def test_what_cameras_are_to_each_other_stays(each):
     cameras = ring()
     own = RNG.normal(size=(len(cameras), each)) * 5e-3
     before = own + common(cameras, each, np.array([4e-3, 0, -3e-3]), 6e-3, np.array([0, 8e-3, 0]))
-    after = np.array(
-        without_common_motion(
-            mi.Float(before.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))
-        )
-    ).reshape(-1, each)
+    after = freed(before, cameras)
     assert np.abs(after - before).max() > 3e-3
-    a, b = (between(corrected(cameras, c.ravel())) for c in (after, before))
+    a, b = (between(corrected(cameras, corrections_of(c))) for c in (after, before))
     np.testing.assert_allclose(a, b, atol=4e-4)
-    again = np.array(
-        without_common_motion(
-            mi.Float(after.ravel().astype(np.float32)), mi.Float(camera_rows(cameras))
-        )
-    )
-    assert np.abs(again.reshape(-1, each) - after).max() < 2e-4  # nothing is left to take out
+    again = freed(after, cameras)
+    assert np.abs(again - after).max() < 2e-4  # nothing is left to take out
     if each > 6:
         np.testing.assert_allclose(
             after[:, 6], before[:, 6], atol=1e-7

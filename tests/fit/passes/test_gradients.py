@@ -14,6 +14,7 @@ import pytest
 
 from relit.conventions import environment_directions
 from relit.fit.duplicates.lit_pile import TINT, TOE
+from relit.fit.passes.camera_corrections import CameraCorrections, CorrectionModel
 from relit.fit.passes.losses import display_loss, dual_loss, mask_loss, normal_loss
 from relit.fit.passes.material_priors import (
     SurfaceOptions,
@@ -141,7 +142,8 @@ class VolumeScene:
         row = dr.arange(mi.UInt32, 6 * VIEWS)
         view, k = row // 6, row % 6
         turn = dr.gather(mi.Float, x["rotations"], view * 3 + k, k < 3)
-        corrections = turn + dr.gather(mi.Float, x["translations"], view * 3 + k - 3, k >= 3)
+        values = turn + dr.gather(mi.Float, x["translations"], view * 3 + k - 3, k >= 3)
+        corrections = CameraCorrections(CorrectionModel.ABOUT_CAMERA, values)
         return batch_of(self.bank, self.pixel, corrections)
 
     def loss(self, x):

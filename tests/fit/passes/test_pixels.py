@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
+from relit.fit.passes.camera_corrections import CameraCorrections, CorrectionModel, corrected
 from relit.fit.passes.pixels import (
     SATURATED,
     batch_of,
-    corrected,
     draw_pixels,
     locate,
     make_bank,
@@ -145,8 +145,9 @@ def test_corrections_are_the_cameras_that_they_stand_for(photos):
     refinement will reach."""
     cameras, images, _ = photos
     bank = make_bank(cameras, images, [None] * 3)
-    corrections = np.random.default_rng(1).normal(size=18) * 0.1
-    batch = batch_of(bank, everything(bank), mi.Float(corrections.astype(np.float32)))
+    numbers = np.random.default_rng(1).normal(size=18) * 0.1
+    corrections = CameraCorrections(CorrectionModel.ABOUT_CAMERA, mi.Float(numbers))
+    batch = batch_of(bank, everything(bank), corrections)
     moved = make_bank(corrected(cameras, corrections), images, [None] * 3)
     there = batch_of(moved, everything(moved))
     np.testing.assert_allclose(columns(batch.d), columns(there.d), atol=2e-6)

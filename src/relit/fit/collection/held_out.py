@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -18,9 +17,10 @@ from relit.fit.collection.surface import (
     light_options,
     start_collection_surface,
 )
+from relit.fit.passes.camera_corrections import CorrectionModel, corrected, no_corrections
 from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
-from relit.fit.passes.pixels import corrected, make_bank
+from relit.fit.passes.pixels import make_bank
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume
 from relit.fit.registration.fine_detail import (
     compare_detail,
@@ -326,9 +326,11 @@ def refine_held_out_cameras(
     """The cameras after a descent with the shape frozen: pose, distance, focal length and small
     lights move. longer: in `frozen_steps`."""
     bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
-    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
     learnt, rates = start_photo_lights(np.array([s.tint for s in shots]), GREY)
-    own = replace(model, reflections=learnt, rates=rates, appearance=shade_photos, extra={})
+    own = replace(
+        model, reflections=learnt, rates=rates, appearance=shade_photos, correction_ratios=None
+    )
     own.grid = replace(model.grid)
     o = VolumeOptions(
         (model.grid.n,),
@@ -342,4 +344,4 @@ def refine_held_out_cameras(
         refine_cameras=options.refine_cameras,
     )
     fit_volume(bank, own, o, NoStage(), seed)
-    return corrected(cameras, np.array(bank.corrections))
+    return corrected(cameras, bank.corrections)

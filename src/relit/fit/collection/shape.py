@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from relit.errors import UserError
 from relit.fit.collection.options import CollectionOptions
 from relit.fit.collection.photos import collection_crops
-from relit.fit.passes.pixels import PixelBank, corrected, make_bank, place_cameras
+from relit.fit.passes.camera_corrections import CorrectionModel, corrected, no_corrections
+from relit.fit.passes.pixels import PixelBank, make_bank, place_cameras
 from relit.fit.passes.volume import (
     VolumeModel,
     VolumeOptions,
@@ -59,7 +59,7 @@ def volume_stage(shots, cameras, weights, linked, tints, fit: FitContext):
     run, options, seed = fit.run, fit.options, fit.seed
     silhouettes = [s.mask for s in shots]
     bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], silhouettes), weights, seed)
-    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
     o = volume_options(options)
     values = tolerant_hull(cameras, silhouettes, o.levels[0])
     limit = (
@@ -72,9 +72,7 @@ def volume_stage(shots, cameras, weights, linked, tints, fit: FitContext):
     if limit is not None and (limit & (values < 0)).any():
         values = distance_of(limit & (values < 0))
     model = fresh_model(values, tints)
-    model.extra["correction_rates"] = mi.Float(
-        np.repeat(np.where(linked, 0.3, 1.0), 7).astype(np.float32)
-    )
+    model.correction_ratios = mi.Float(np.repeat(np.where(linked, 0.3, 1.0), 7).astype(np.float32))
     if run.done("volume"):
         restore_model(model, bank, run_arrays(run, "volume", "checkpoint"))
     else:
@@ -82,7 +80,7 @@ def volume_stage(shots, cameras, weights, linked, tints, fit: FitContext):
             "volume", steps=sum(o.steps), title="shape and cameras (volume pass)"
         ) as stage:
             fit_volume(bank, model, o, stage, seed)
-    cameras = corrected(cameras, np.array(bank.corrections))
+    cameras = corrected(cameras, bank.corrections)
     place_cameras(bank, cameras)
     return bank, cameras, model
 
@@ -96,7 +94,7 @@ def opened_stage(
     run, options, seed = fit.run, fit.options, fit.seed
     if options.hollows == 0 or len(shots) < PHOTOS:
         return cameras
-    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
     if run.done("hollows"):
         found = run_arrays(run, "hollows", "hollows")["distances"]
     else:
@@ -134,7 +132,7 @@ def opened_stage(
         ) as stage:
             next_level(model, finer.levels[0], BAND, lambda values: without(values, found))
             fit_volume(bank, model, finer, stage, seed + 1)
-    cameras = corrected(cameras, np.array(bank.corrections))
+    cameras = corrected(cameras, bank.corrections)
     place_cameras(bank, cameras)
     return cameras
 

@@ -33,28 +33,30 @@ from relit.fit.flash.features import FlashView, capture_features, network_featur
 from relit.fit.flash.lobe_clusters import start_kinship
 from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, FlashTerms, fit_flash_surface
 from relit.fit.passes.held_out import score_held_out
-from relit.fit.passes.load_photos import load_pixels
-from relit.fit.passes.pixels import PixelBank
-from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.fit.passes.load_photos import UnitPhotos, load_pixels
+from relit.fit.passes.volume import (
+    VolumeModel,
+    VolumeOptions,
+    VolumeResult,
+    fit_volume,
+    start_model,
+    volume_result,
+)
 from relit.fit.shape.hollows import HollowOptions, open_hollows, without
-from relit.fit.shape.odd_photos import check_masks
-from relit.fit.shape.outlines import follow_outlines
+from relit.fit.shape.mesh_stage import TexelMap, outlined_mesh, texels_of, with_atlas
 from relit.fit.shape.placing import placed_mesh
-from relit.geometry.atlas import unwrap
-from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import NoShape, visual_hull
 from relit.geometry.mesh import extract_mesh
-from relit.geometry.sdf import dense_values, row_features
+from relit.geometry.sdf import dense_values
 from relit.masks.threshold import Backdrop
 from relit.materials.plastic_as_gltf import base_colour
 from relit.materials.plastic_field import MOST_SPECULAR, plastic_pictures, start_plastic
 from relit.materials.rough_plastic import IOR, Coat
 from relit.recipe import FitContext, Recipe
 from relit.rendering.appearance.fixed_light import features_at
-from relit.rendering.appearance.flash_light import FlashAppearance, alpha_on, start_learnt
+from relit.rendering.appearance.flash_light import FlashAppearance, start_learnt
 from relit.rendering.transport import TraceableMesh
-from relit.run import run_arrays
-from relit.scene import Asset, Camera, Capture, Flash, Material, Mesh
+from relit.scene import Asset, Capture, Flash, Material, Mesh
 from relit.settings import check_levels, check_parts, preset
 
 BRIGHTEST = 0.8  # the 99th percentile of the diffuse albedo, by which its scale is set
@@ -166,26 +168,15 @@ def reconstruct(capture: Capture, run, options: FlashOptions, seed: int = 0) -> 
     fit = FitContext(run, options, seed)
     check_levels(options)
     check_backdrop(capture)
-    bank, cameras, masks, level = load_pixels(capture, options, run)
-    check_photos(bank, cameras, masks, level)
-    bank.drop_saturated = True
-    coat = Coat(options.ior)
+    photos = load_pixels(capture, options, run)
+    check_photos(photos)
+    photos.bank.drop_saturated = True
     if options.dino and not run.done("surface"):
-        DinoNetwork(
-            network_file(options.dino)
-        )  # what is wrong with it is told before anything is computed
-    if run.done("mesh"):
-        parts = run_arrays(run, "mesh", "mesh")
-    else:
-        model = volume_stage(bank, cameras, masks, level, coat, fit)
-        score_held_out(capture, model, run, np.eye(4))
-        parts = mesh_stage(model, cameras, masks, [p.name for p in capture.photos], run, options)
-    mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
-    if run.done("surface"):
-        maps = run_arrays(run, "surface", "maps")
-    else:
-        maps = surface_stage(bank, cameras, mesh, parts, coat, fit)
-    return assemble(capture, mesh, maps, options.ior)
+        DinoNetwork(network_file(options.dino))  # a file that cannot be used is named at once
+    volume = volume_stage(photos, capture, fit)
+    shaped = mesh_stage(photos, volume, fit)
+    maps = surface_stage(photos, shaped, fit)
+    return assemble(capture, shaped.mesh, maps, options.ior)
 
 
 def check_backdrop(capture: Capture) -> None:
@@ -205,22 +196,22 @@ def check_backdrop(capture: Capture) -> None:
         )
 
 
-def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarray) -> None:
-    """Raises UserError for photos that are no flash capture that could be reconstructed. level:
-    mean radiance of the object (3,)."""
-    if float(np.max(level)) < 0.004:
+def check_photos(photos: UnitPhotos) -> None:
+    """Raises UserError for photos that are no flash capture that could be reconstructed."""
+    bank = photos.bank
+    if float(np.max(photos.level)) < 0.004:
         raise UserError(
             "the photos are black",
             "the flash did not fire, or the exposure was far too short",
             "look at the photos, and take them again",
         )
-    if masks is None:
+    if photos.masks is None:
         raise UserError(
             "the surroundings are not dark, and there are no masks",
             "a flash capture is taken in a dark room, where the flash is the only light and the background stays black",
             "take --capture multiview for photos under fixed lamps; or give masks for flash photos with a visible background",
         )
-    centres = np.array([c.centre for c in cameras])
+    centres = np.array([c.centre for c in photos.cameras])
     reach = np.linalg.norm(centres, axis=1).mean()
     if np.linalg.norm(centres - centres.mean(0), axis=1).max() < 0.05 * reach:
         raise UserError(
@@ -243,71 +234,77 @@ def check_photos(bank: PixelBank, cameras: list[Camera], masks, level: np.ndarra
         )
 
 
-def volume_stage(
-    bank: PixelBank, cameras: list[Camera], masks, level, coat: Coat, fit: FitContext
-) -> VolumeModel:
-    """Visual hull, then the volume pass with the flash's shading. The model's `extra` holds the
-    intensity."""
-    run, options, seed = fit.run, fit.options, fit.seed
-    distance2 = float(np.median([c.centre @ c.centre for c in cameras]))
-    intensity = np.pi * distance2 * float(level.mean()) / (START_ALBEDO * MEAN_COSINE)
-    shadows = options.shadows and "shadow" not in options.without
-    free = (
-        np.inf
-        if "offset" in options.without
-        else sum(options.level_steps) - (1 - HELD) * options.level_steps[-1]
-    )
-    with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
-        try:
-            values = visual_hull(cameras, masks, options.levels[0])
-        except NoShape:
-            raise UserError(
-                "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
-                "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
-                "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS",
-                code=4,
-            ) from None
+def volume_stage(photos: UnitPhotos, capture: Capture, fit: FitContext) -> VolumeResult:
+    """Visual hull, then the volume pass with the flash's shading, and its score in the photos that
+    the capture sets aside."""
+    run, options, bank = fit.run, fit.options, photos.bank
+    coat, shadow = Coat(options.ior), "shadow" not in options.without
+    mirrors = options.directions > 0 and "interreflection" not in options.without
 
-        def start(values: np.ndarray, full: bool) -> VolumeModel:
-            model = start_model(values, START_ALBEDO * level / level.mean(), None, full=full)
-            model.reflections, rates = start_learnt()
-            model.rates = rates_by_step(
-                rates, 0 if full and "offset" not in options.without else free
-            )
-            appearance = FlashAppearance(coat, intensity, options.levels[-1] if shadows else np.inf)
-            model.appearance, appearance.model = appearance, model
-            model.extra["intensity"] = intensity
-            return model
-
-        if options.hollows > 0 and not stage.load("checkpoint"):
-            o = HollowOptions(options.hollows)
-            coarse = visual_hull(cameras, masks, o.nodes)
-            show = run.progress("hollows that no silhouette shows")
-            values = without(
-                values,
-                open_hollows(
-                    bank, cameras, coarse, lambda v: start(v, True), o, run.say, seed, show
-                ),
-            )
-        model = start(values, False)
-        mirrors = options.directions > 0 and "interreflection" not in options.without
-        shadow = "shadow" not in options.without
-        begin_level = (lambda m: look_around(bank, cameras, m, coat, shadow)) if mirrors else None
-        fit_volume(
-            bank,
-            model,
-            VolumeOptions(options.levels, options.level_steps, options.rays),
-            stage,
-            seed,
-            begin_level,
-        )
-        model.appearance.around = (
-            None  # it holds the training photos; the score of others goes without
-        )
+    def computed(stage) -> VolumeResult:
+        model = start_of_volume(photos, stage, fit)
+        begin_level = (lambda m: look_around(photos, m, coat, shadow)) if mirrors else None
+        passes = VolumeOptions(options.levels, options.level_steps, options.rays)
+        fit_volume(bank, model, passes, stage, fit.seed, begin_level)
+        # it holds the training photos; the score of others goes without
+        model.appearance.around = None
         offset = np.array(model.reflections)[:3]
         run.say(
             f"flash after the volume pass: offset {offset.round(4).tolist()} of the object sphere's radius"
         )
+        score_held_out(capture, model, run, np.eye(4))
+        return volume_result(model, bank)
+
+    steps = sum(options.level_steps)
+    return run.cached("volume", VolumeResult, computed, steps=steps, title="shape (volume pass)")
+
+
+def intensity_of(photos: UnitPhotos) -> float:
+    """Intensity of the flash with which a mean albedo of START_ALBEDO has the photos' mean radiance
+    (PIR Eq. 2), in radiance times squared unit lengths."""
+    distance2 = float(np.median([c.centre @ c.centre for c in photos.cameras]))
+    return np.pi * distance2 * float(photos.level.mean()) / (START_ALBEDO * MEAN_COSINE)
+
+
+def start_of_volume(photos: UnitPhotos, stage, fit: FitContext) -> VolumeModel:
+    """The visual hull, opened where the photos contradict it."""
+    run, options = fit.run, fit.options
+    try:
+        values = visual_hull(photos.cameras, photos.masks, options.levels[0])
+    except NoShape:
+        raise UserError(
+            "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
+            "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
+            "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS",
+            code=4,
+        ) from None
+    if options.hollows > 0 and not stage.load("checkpoint"):
+        o = HollowOptions(options.hollows)
+        coarse = visual_hull(photos.cameras, photos.masks, o.nodes)
+        fresh = lambda v: model_under_flash(v, photos, options, full=True)  # noqa: E731
+        show = run.progress("hollows that no silhouette shows")
+        opened = open_hollows(
+            photos.bank, photos.cameras, coarse, fresh, o, run.say, fit.seed, show
+        )
+        values = without(values, opened)
+    return model_under_flash(values, photos, options, full=False)
+
+
+def model_under_flash(
+    values: np.ndarray, photos: UnitPhotos, options: FlashOptions, full: bool
+) -> VolumeModel:
+    """A model of distances (n, n, n) under the flash. full: optimise every node, and the flash's
+    offset from the first step on."""
+    level, fixed = photos.level, "offset" in options.without
+    shadows = options.shadows and "shadow" not in options.without
+    model = start_model(values, START_ALBEDO * level / level.mean(), None, full=full)
+    model.reflections, rates = start_learnt()
+    free = sum(options.level_steps) - (1 - HELD) * options.level_steps[-1]
+    model.rates = rates_by_step(rates, np.inf if fixed else 0 if full else free)
+    appearance = FlashAppearance(
+        Coat(options.ior), intensity_of(photos), options.levels[-1] if shadows else np.inf
+    )
+    model.appearance, appearance.model = appearance, model
     return model
 
 
@@ -319,141 +316,140 @@ def rates_by_step(rates, free: float) -> Callable:
     return lambda i: rates if i >= free else held
 
 
-def look_around(
-    bank: PixelBank, cameras: list[Camera], model: VolumeModel, coat: Coat, shadow: bool = True
-) -> None:
-    """Tell the model's appearance what light its surface, as it is now, throws on itself. shadow:
-    whether the flash throws any."""
+def look_around(photos: UnitPhotos, model: VolumeModel, coat: Coat, shadow: bool = True) -> None:
+    """Give the model's appearance the light that its surface, as it is now, throws on itself.
+    shadow: whether the flash casts any."""
     values = dense_values(model.grid)
     flash = FlashView(np.array(model.reflections)[:3], float(model.appearance.intensity[0]), shadow)
-    ambient = find_ambient(
-        bank, cameras, extract_mesh(values, faces=COARSE_FACES), coat, flash, BRIGHTEST
-    )
+    mesh = extract_mesh(values, faces=COARSE_FACES)
+    ambient = find_ambient(photos.bank, photos.cameras, mesh, coat, flash, BRIGHTEST)
     model.appearance.around = ambient.around(values, coat)
 
 
-def mesh_stage(
-    model: VolumeModel, cameras: list[Camera], masks, names: list[str], run, options: FlashOptions
-) -> dict[str, np.ndarray]:
-    """Mesh, its outlines where the masks have them, atlas, and what the volume pass knows of each
-    vertex. Returns (and keeps) vertices, faces, normals, uvs, albedo (V, 4: diffuse and specular),
-    alpha (V,), offset (3,), intensity. names: of the photos."""
-    with run.stage("mesh", title="mesh and atlas") as stage:
-        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
+@dataclass(frozen=True)
+class FlashMesh:
+    """mesh: in the unit frame, with an atlas. albedo: (V, 4) of its vertices, diffuse (linear RGB)
+    and specular, up to scale. offset: (3,) of the flash from the camera: right, down, forward, in
+    unit lengths. intensity: of the flash."""
+
+    mesh: Mesh
+    albedo: np.ndarray
+    offset: np.ndarray
+    intensity: float
+
+
+def mesh_stage(photos: UnitPhotos, volume: VolumeResult, fit: FitContext) -> FlashMesh:
+    """Mesh, its outlines where the masks have them, atlas, and what the volume pass has found of
+    each vertex."""
+    run, options = fit.run, fit.options
+
+    def computed(stage) -> FlashMesh:
+        mesh = extract_mesh(volume.values, faces=options.faces)
         rounds = 0 if "refinement" in options.without else options.outlines
-        mesh = follow_outlines(mesh, cameras, masks, rounds)
-        if note := check_masks(mesh, cameras, masks, names):
-            run.say(note)
-        mesh, how = unwrap(mesh, options.texture)
-        if how != "xatlas":
-            run.say(
-                "note: the mesh was too difficult for charts; its atlas has one cell for every two faces"
-            )
-        learnt = np.array(model.reflections)
-        parts = {
-            "vertices": mesh.vertices,
-            "faces": mesh.faces,
-            "normals": mesh.normals,
-            "uvs": mesh.uvs,
-            "albedo": np.maximum(
-                features_at(model.grid, row_features(model.grid), mesh.vertices), 0
-            ).astype(np.float32),
-            "alpha": alpha_on(learnt, mesh.vertices),
-            "offset": learnt[:3],
-            "intensity": np.array(model.extra["intensity"]),
-        }
-        stage.save("mesh", **parts)
-    return parts
+        mesh = outlined_mesh(mesh, photos, photos.cameras, rounds, run.say)
+        mesh = with_atlas(mesh, options.texture, run.say)
+        albedo = np.maximum(features_at(volume.grid(), volume.features, mesh.vertices), 0)
+        return FlashMesh(
+            mesh, albedo.astype(np.float32), volume.reflections[:3], intensity_of(photos)
+        )
+
+    return run.cached("mesh", FlashMesh, computed, title="mesh and atlas")
 
 
-def surface_stage(bank: PixelBank, cameras, mesh: Mesh, parts, coat: Coat, fit: FitContext):
-    """Material and flash. Returns (and keeps) diffuse, specular, alpha, normal, offset and
-    intensity (unit frame)."""
-    run, options, seed = fit.run, fit.options, fit.seed
-    o = surface_options(options)
-    network = DinoNetwork(network_file(options.dino)) if options.dino else None
-    with run.stage("surface", steps=o.steps, title="material and flash (surface pass)") as stage:
-        face, bary = rasterise_atlas(mesh, options.texture)
-        known = face >= 0
-        spread = lambda v: fill_gutters(interpolate(v, mesh.faces, face, bary), known)  # noqa: E731
-        traceable = TraceableMesh(mesh, np.zeros_like(mesh.vertices))
-        flash = FlashView(parts["offset"], float(parts["intensity"]), o.shadow)
-        texels = {
-            "x": interpolate(mesh.vertices, mesh.faces, face, bary)[known],
-            "n": interpolate(mesh.normals, mesh.faces, face, bary)[known],
-        }
-        ambient = (
-            None if o.directions == 0 else find_ambient(bank, cameras, mesh, coat, flash, BRIGHTEST)
-        )
-        found = capture_features(
-            bank, cameras, traceable, texels["x"], texels["n"], coat, flash, ambient
-        )
-        diffuse = spread(parts["albedo"][:, :3])
-        diffuse[known] = np.where(found.seen[:, None], found.albedo, diffuse[known])
-        scale = BRIGHTEST / max(float(np.percentile(diffuse[known].max(1), 99)), 1e-6)
-        specular = np.clip(spread(parts["albedo"][:, 3:])[..., 0] * scale, 0.05, MOST_SPECULAR)
-        specular = np.full_like(
-            specular, np.median(specular[known])
-        )  # one lobe all over: that of the volume pass is coarse
-        alpha = np.full_like(specular, START_WIDTH)
-        field = start_plastic(np.clip(fill_gutters(diffuse, known) * scale, 0, 1), specular, alpha)
-        features = np.zeros((*known.shape, 4), np.float32)
-        features[known] = found.features
-        if network is not None:
-            features[known] = network_features(
-                bank, cameras, traceable, texels["x"], texels["n"], flash, network
-            )
-        log_intensity = mi.Float([float(np.log(flash.intensity / scale))])
-        features = fill_gutters(features, known)
-        kinship = None
-        if "features" not in options.without:
-            place = PLACE * spread(mesh.vertices)
-            lobe = np.stack([specular, alpha], -1)
-            kinship = start_kinship(np.concatenate([features, place], -1), known, lobe)
-        model = FlashModel(
-            field,
-            mi.Float(features.ravel()),
-            kinship,
-            mi.Float(parts["offset"]),
-            log_intensity,
-            coat,
-        )
-        if ambient is not None:
-            model.around = ambient.on_texels(texels["x"], texels["n"], known, coat)
-        fit_flash_surface(FlashTerms(bank, cameras, traceable, model, o), stage, seed)
-        maps = {
-            name: fill_gutters(picture, known)
-            for name, picture in plastic_pictures(model.field).items()
-        }
-        maps |= {
-            "offset": np.array(model.offset),
-            "intensity": np.exp(np.array(model.log_intensity)),
-        }
-        stage.save("maps", **maps)
-        right, down, forward = maps["offset"]
+@dataclass(frozen=True)
+class PlasticMaps:
+    """Textures (S, S[, 3]) of a rough plastic, linear: diffuse albedo, specular albedo, alpha
+    (width of the lobe), normal (tangent space). offset: (3,) of the flash in unit lengths.
+    intensity: (1,) of the flash."""
+
+    diffuse: np.ndarray
+    specular: np.ndarray
+    alpha: np.ndarray
+    normal: np.ndarray
+    offset: np.ndarray
+    intensity: np.ndarray
+
+
+def surface_stage(photos: UnitPhotos, shaped: FlashMesh, fit: FitContext) -> PlasticMaps:
+    """Material and flash (PIR Sec. 3.3 to 3.6)."""
+    run, o = fit.run, surface_options(fit.options)
+
+    def computed(stage) -> PlasticMaps:
+        texels = texels_of(shaped.mesh, fit.options.texture)
+        terms = start_of_surface(photos, shaped, texels, fit)
+        fit_flash_surface(terms, stage, fit.seed)
+        model = terms.model
+        maps = {name: texels.filled(t) for name, t in plastic_pictures(model.field).items()}
+        offset = np.array(model.offset)
+        right, down, forward = offset
         run.say(
             f"flash: offset ({right:.4f}, {down:.4f}, {forward:.4f}) of the object sphere's radius: right, down, forward of the camera"
         )
-    return maps
+        return PlasticMaps(**maps, offset=offset, intensity=np.exp(np.array(model.log_intensity)))
+
+    title = "material and flash (surface pass)"
+    return run.cached("surface", PlasticMaps, computed, steps=o.steps, title=title)
 
 
-def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], ior: float) -> Asset:
+def start_of_surface(
+    photos: UnitPhotos, shaped: FlashMesh, texels: TexelMap, fit: FitContext
+) -> FlashTerms:
+    """Plastic and flash that the surface pass begins with: diffuse albedos from the photos, one
+    lobe all over, since that of the volume pass is coarse."""
+    options, o = fit.options, surface_options(fit.options)
+    bank, cameras, mesh, coat = photos.bank, photos.cameras, shaped.mesh, Coat(options.ior)
+    traceable = TraceableMesh(mesh, np.zeros_like(mesh.vertices))
+    flash = FlashView(shaped.offset, shaped.intensity, o.shadow)
+    known = texels.known
+    x, n = texels.on_faces(mesh.vertices)[known], texels.on_faces(mesh.normals)[known]
+    ambient = None
+    if o.directions > 0:
+        ambient = find_ambient(bank, cameras, mesh, coat, flash, BRIGHTEST)
+    found = capture_features(bank, cameras, traceable, x, n, coat, flash, ambient)
+    diffuse = texels.spread(shaped.albedo[:, :3])
+    diffuse[known] = np.where(found.seen[:, None], found.albedo, diffuse[known])
+    scale = BRIGHTEST / max(float(np.percentile(diffuse[known].max(1), 99)), 1e-6)
+    specular = np.clip(texels.spread(shaped.albedo[:, 3:])[..., 0] * scale, 0.05, MOST_SPECULAR)
+    specular = np.full_like(specular, np.median(specular[known]))
+    alpha = np.full_like(specular, START_WIDTH)
+    features = np.zeros((*known.shape, 4), np.float32)
+    features[known] = found.features
+    if options.dino:
+        network = DinoNetwork(network_file(options.dino))
+        features[known] = network_features(bank, cameras, traceable, x, n, flash, network)
+    features = texels.filled(features)
+    kinship = None
+    if "features" not in options.without:
+        place = PLACE * texels.spread(mesh.vertices)
+        lobe = np.stack([specular, alpha], -1)
+        kinship = start_kinship(np.concatenate([features, place], -1), known, lobe)
+    model = FlashModel(
+        start_plastic(np.clip(texels.filled(diffuse) * scale, 0, 1), specular, alpha),
+        mi.Float(features.ravel()),
+        kinship,
+        mi.Float(shaped.offset),
+        mi.Float([float(np.log(flash.intensity / scale))]),
+        coat,
+    )
+    if ambient is not None:
+        model.around = ambient.on_texels(x, n, known, coat)
+    return FlashTerms(bank, cameras, traceable, model, o)
+
+
+def assemble(capture: Capture, mesh: Mesh, maps: PlasticMaps, ior: float) -> Asset:
     """The asset in the frame of the user's cameras (`placed_mesh`)."""
     (placed, world_from_asset), radius = placed_mesh(capture, mesh), capture.sphere.radius
-    roughness = np.sqrt(maps["alpha"])
-    base = base_colour(maps["diffuse"], roughness, maps["specular"], ior)
+    roughness = np.sqrt(maps.alpha)
+    base = base_colour(maps.diffuse, roughness, maps.specular, ior)
     metallic = np.zeros((1, 1), np.float32)
-    material = Material(
-        base, roughness, metallic, ior, maps["specular"], maps["normal"], maps["diffuse"]
-    )
+    material = Material(base, roughness, metallic, ior, maps.specular, maps.normal, maps.diffuse)
     flash = Flash(
-        maps["offset"].astype(np.float64) * radius,
-        np.full(3, float(maps["intensity"][0]) * radius**2),
+        maps.offset.astype(np.float64) * radius,
+        np.full(3, float(maps.intensity[0]) * radius**2),
     )
     cameras = tuple((p.name, p.camera) for p in capture.photos)
-    return Asset(
-        placed, material, world_from_asset, None, cameras, {"material": "rough_plastic"}, flash
-    )
+    meta = {"material": "rough_plastic"}
+    return Asset(placed, material, world_from_asset, None, cameras, meta, flash)
 
 
 RECIPE = Recipe(

@@ -15,33 +15,38 @@ The recipe of the `multiview` capture. Stages:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
+import mitsuba as mi
 import numpy as np
 
 from relit.conventions import move_points, move_pose
 from relit.errors import UserError
+from relit.fit.passes.camera_corrections import corrected
 from relit.fit.passes.explore import explore, first_shape
 from relit.fit.passes.first_material import PAINT, describe, first_material
 from relit.fit.passes.held_out import score_held_out
-from relit.fit.passes.load_photos import load_pixels
+from relit.fit.passes.load_photos import UnitPhotos, load_pixels
 from relit.fit.passes.material_priors import SurfaceOptions
-from relit.fit.passes.pixels import PixelBank, corrected, place_cameras
-from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
-from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume, start_model
+from relit.fit.passes.pixels import PixelBank, place_cameras
+from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.passes.volume import (
+    Mend,
+    VolumeModel,
+    VolumeOptions,
+    VolumeResult,
+    fit_volume,
+    start_model,
+    volume_result,
+)
 from relit.fit.shape.hollows import without
-from relit.fit.shape.inpaint import painted_over
 from relit.fit.shape.lids import FIRST, open_lids
-from relit.fit.shape.odd_photos import check_masks
-from relit.fit.shape.outlines import follow_outlines
+from relit.fit.shape.mesh_stage import TexelMap, outlined_mesh, texels_of, with_atlas
 from relit.fit.shape.placing import placed_mesh
 from relit.fit.shape.unseen import seen_faces, without_unseen
-from relit.geometry.atlas import unwrap
-from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.hull import NoShape, visual_hull
 from relit.geometry.mesh import extract_mesh, vertex_areas
-from relit.geometry.sdf import dense_values, row_features
 from relit.geometry.se3 import align_cameras, nearest_rotation
 from relit.materials.field import normal_map, pictures
 from relit.materials.intrinsic import base_without_shading
@@ -49,7 +54,6 @@ from relit.recipe import FitContext, Recipe
 from relit.rendering.appearance.fixed_light import mean_radiance
 from relit.rendering.background import start_background
 from relit.rendering.transport import TraceableMesh
-from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Material, Mesh
 from relit.settings import check_levels, check_parts, preset
 
@@ -173,38 +177,29 @@ def reconstruct(capture: Capture, run, options: MultiviewOptions, seed: int = 0)
         raise ValueError("reconstruct needs cameras and the object sphere")
     fit = FitContext(run, options, seed)
     check_levels(options)
-    bank, cameras, masks, level = load_pixels(capture, options, run)
+    photos = load_pixels(capture, options, run)
+    volume = volume_stage(photos, capture, fit)
+    shaped = moved_back(mesh_stage(photos, volume, fit), photos, volume, options)
+    cameras, _ = refined_cameras(photos.cameras, volume, options)
+    if options.refine_cameras > 0:
+        place_cameras(photos.bank, cameras)
+    maps = surface_stage(photos.bank, cameras, shaped, fit)
+    refined = cameras if options.refine_cameras > 0 else None
+    return assemble(capture, shaped.mesh, maps, refined)
 
-    if run.done("mesh"):
-        parts = run_arrays(run, "mesh", "mesh")
-    else:
-        model = volume_stage(bank, cameras, masks, level, fit)
-        score_held_out(capture, model, run, refined_cameras(cameras, run, options)[1])
-        parts = mesh_stage(model, cameras, masks, [p.name for p in capture.photos], run, options)
-    cameras, parts = follow_cameras(bank, cameras, parts, run, options)
-    mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
 
-    if run.done("surface"):
-        maps = run_arrays(run, "surface", "maps")
-    else:
-        maps = surface_stage(bank, cameras, mesh, parts["radiance"], fit)
-    poses = (
-        [move_pose(capture.sphere.world_from_unit, c.world_from_camera) for c in cameras]
-        if options.refine_cameras > 0
-        else None
-    )
-    return assemble(capture, mesh, maps, poses)
+# ---------------------------------------------------------------- cameras
 
 
 def refined_cameras(
-    cameras: list[Camera], run, options: MultiviewOptions
+    cameras: list[Camera], volume: VolumeResult, options: MultiviewOptions
 ) -> tuple[list[Camera], np.ndarray]:
     """The cameras (unit frame) with the corrections that the volume pass has found, and
     unit_from_found (4, 4): corrections can drift together with the shape, so both are carried back
     to where the cameras were. Unchanged, and the identity, where cameras are exact."""
     if options.refine_cameras <= 0:
         return cameras, np.eye(4)
-    found = found_cameras(cameras, run, options)
+    found = corrected(cameras, volume.camera_corrections())
     poses = np.array([c.world_from_camera for c in found])
     unit_from_found = align_cameras(poses, np.array([c.world_from_camera for c in cameras]))
     return [
@@ -212,209 +207,208 @@ def refined_cameras(
     ], unit_from_found
 
 
-def found_cameras(cameras: list[Camera], run, options: MultiviewOptions) -> list[Camera]:
-    """The cameras (unit frame) as the shape of the volume pass has them, with its corrections where
-    they are refined."""
-    return (
-        cameras
-        if options.refine_cameras <= 0
-        else corrected(cameras, run_arrays(run, "volume", "checkpoint")["corrections"])
-    )
-
-
-def follow_cameras(
-    bank: PixelBank,
-    cameras: list[Camera],
-    parts: dict[str, np.ndarray],
-    run,
-    options: MultiviewOptions,
-):
-    """Refined cameras for the pixel bank, and the mesh in their frame; returns (cameras, parts)."""
-    cameras, unit_from_found = refined_cameras(cameras, run, options)
+def moved_back(
+    shaped: RadiantMesh, photos: UnitPhotos, volume: VolumeResult, options: MultiviewOptions
+) -> RadiantMesh:
+    """The mesh in the frame of the refined cameras (`refined_cameras`)."""
     if options.refine_cameras <= 0:
-        return cameras, parts
-    place_cameras(bank, cameras)
-    turn = nearest_rotation(unit_from_found[:3, :3])
-    moved = move_points(unit_from_found, parts["vertices"]).astype(np.float32)
-    return cameras, {
-        **parts,
-        "vertices": moved,
-        "normals": (parts["normals"] @ turn.T).astype(np.float32),
-    }
+        return shaped
+    _, unit_from_found = refined_cameras(photos.cameras, volume, options)
+    mesh, turn = shaped.mesh, nearest_rotation(unit_from_found[:3, :3])
+    moved = replace(
+        mesh,
+        vertices=move_points(unit_from_found, mesh.vertices).astype(np.float32),
+        normals=(mesh.normals @ turn.T).astype(np.float32),
+    )
+    return replace(shaped, mesh=moved)
 
 
-def volume_stage(
-    bank: PixelBank, cameras: list[Camera], masks, level, fit: FitContext
-) -> VolumeModel:
+# ---------------------------------------------------------------- stages
+
+
+def volume_stage(photos: UnitPhotos, capture: Capture, fit: FitContext) -> VolumeResult:
     """Hull, or without masks a first shape from a radiance field of the whole scene; then the
-    volume pass."""
-    run, options, seed = fit.run, fit.options, fit.seed
-    if masks is None:
-        field = start_background(options.background, level)
-        with run.stage(
-            "explore", steps=options.explore_steps, title="whole scene (no masks)"
-        ) as stage:
-            explore(bank, field, options.explore_steps, options.rays // 2, stage, seed)
-            stage.save("field", step=options.explore_steps, cells=np.array(field.cells))
-    with run.stage("volume", steps=sum(options.level_steps), title="shape (volume pass)") as stage:
-        n, mend = options.levels[0], None
-        if masks is not None:
-            try:
-                values = visual_hull(cameras, masks, n)
-            except NoShape:
-                raise UserError(
-                    "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
-                    "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
-                    "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or --masks none to do without masks",
-                    code=4,
-                ) from None
-            hollows = (
-                sought_hollows(bank, cameras, masks, level, run, stage, options, seed)
-                if options.hollows > 0
-                else None
-            )
-            model = start_model(without(values, hollows), level, None, full=False)
-            mend = partial(
-                without, hollows=hollows
-            )  # its rim and walls are finer than the first level's voxels
-        else:
-            try:
-                values = first_shape(bank, cameras, field, n)
-            except ValueError:
-                raise UserError(
-                    "nothing solid was found inside the object sphere",
-                    "the cameras are wrong, or the sphere lies beside the object",
-                    "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or masks",
-                    code=4,
-                ) from None
-            model = start_model(values, level, field, full=False)
-        fit_volume(bank, model, volume_options(options), stage, seed, mend=mend)
-    return model
+    volume pass, and its score in the photos that the capture sets aside."""
+    run, options = fit.run, fit.options
+
+    def computed(stage) -> VolumeResult:
+        model, mend = (
+            masked_start(photos, stage, fit) if photos.masks else unmasked_start(photos, fit)
+        )
+        fit_volume(photos.bank, model, volume_options(options), stage, fit.seed, mend=mend)
+        volume = volume_result(model, photos.bank)
+        _, unit_from_found = refined_cameras(photos.cameras, volume, options)
+        score_held_out(capture, model, run, unit_from_found)
+        return volume
+
+    steps = sum(options.level_steps)
+    return run.cached("volume", VolumeResult, computed, steps=steps, title="shape (volume pass)")
 
 
-def sought_hollows(
-    bank: PixelBank,
-    cameras: list[Camera],
-    masks,
-    level,
-    run,
-    stage,
-    options: MultiviewOptions,
-    seed: int,
-):
+def masked_start(photos: UnitPhotos, stage, fit: FitContext) -> tuple[VolumeModel, Mend]:
+    """The visual hull without the hollows that were found under its flat faces, and what takes
+    these away from the distances of the next level, whose voxels show their rim and walls."""
+    options = fit.options
+    try:
+        values = visual_hull(photos.cameras, photos.masks, options.levels[0])
+    except NoShape:
+        raise UserError(
+            "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
+            "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
+            "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or --masks none to do without masks",
+            code=4,
+        ) from None
+    hollows = sought_hollows(photos, stage, fit) if options.hollows > 0 else None
+    model = start_model(without(values, hollows), photos.level, None, full=False)
+    return model, partial(without, hollows=hollows)
+
+
+def unmasked_start(photos: UnitPhotos, fit: FitContext) -> tuple[VolumeModel, None]:
+    """The surface of a radiance field of the whole scene, and that field as background."""
+    run, options, bank = fit.run, fit.options, photos.bank
+    field = start_background(options.background, photos.level)
+    with run.stage("explore", steps=options.explore_steps, title="whole scene (no masks)") as stage:
+        explore(bank, field, options.explore_steps, options.rays // 2, stage, fit.seed)
+        stage.save("field", step=options.explore_steps, cells=np.array(field.cells))
+    try:
+        values = first_shape(bank, photos.cameras, field, options.levels[0])
+    except ValueError:
+        raise UserError(
+            "nothing solid was found inside the object sphere",
+            "the cameras are wrong, or the sphere lies beside the object",
+            "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or masks",
+            code=4,
+        ) from None
+    return start_model(values, photos.level, field, full=False), None
+
+
+def sought_hollows(photos: UnitPhotos, stage, fit: FitContext) -> np.ndarray | None:
     """What `fit.shape.lids.open_lids` takes away from the visual hull, (n, n, n) distances or None; kept
     in the stage."""
-    saved = stage.load("hollows")
+    run, saved = fit.run, stage.load("hollows")
     if saved is None:
-        coarse = visual_hull(cameras, masks, FIRST.nodes)
-        fresh = partial(start_model, level=level, background=None, full=True)
+        coarse = visual_hull(photos.cameras, photos.masks, FIRST.nodes)
+        fresh = partial(start_model, level=photos.level, background=None, full=True)
         show = run.progress("hollows that no silhouette shows")
         found = open_lids(
-            bank, cameras, coarse, fresh, run.say, seed, options.hollows, progress=show
+            photos.bank,
+            photos.cameras,
+            coarse,
+            fresh,
+            run.say,
+            fit.seed,
+            fit.options.hollows,
+            progress=show,
         )
         saved = {"distances": np.zeros((0, 0, 0), np.float32) if found is None else found}
         stage.save("hollows", **saved)
     return saved["distances"] if saved["distances"].size else None
 
 
-def mesh_stage(
-    model: VolumeModel,
-    cameras: list[Camera],
-    masks,
-    names: list[str],
-    run,
-    options: MultiviewOptions,
-) -> dict[str, np.ndarray]:
+@dataclass(frozen=True)
+class RadiantMesh:
+    """mesh: in the unit frame, with an atlas. radiance: (V, 3) mean outgoing radiance of each
+    vertex, linear."""
+
+    mesh: Mesh
+    radiance: np.ndarray
+
+
+def mesh_stage(photos: UnitPhotos, volume: VolumeResult, fit: FitContext) -> RadiantMesh:
     """Mesh, its outlines where the masks have them, or without masks no more than the photos see,
-    atlas, and the mean radiance of each vertex. Returns (and keeps) vertices, faces, normals, uvs,
-    radiance. names: of the photos."""
-    with run.stage("mesh", title="mesh and atlas") as stage:
-        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
-        found = found_cameras(cameras, run, options)
-        mesh = (
-            without_unseen(mesh, found)
-            if masks is None
-            else follow_outlines(mesh, found, masks, options.outlines)
-        )
-        if masks is not None and (note := check_masks(mesh, found, masks, names)):
-            run.say(note)
-        mesh, how = unwrap(mesh, options.texture)
-        if how != "xatlas":
-            run.say(
-                "note: the mesh was too difficult for charts; its atlas has one cell for every two faces"
-            )
-        parts = {
-            "vertices": mesh.vertices,
-            "faces": mesh.faces,
-            "normals": mesh.normals,
-            "uvs": mesh.uvs,
-            "radiance": mean_radiance(
-                model.grid, row_features(model.grid), model.reflections, mesh.vertices
-            ),
-        }
-        stage.save("mesh", **parts)
-    return parts
+    atlas, and the mean radiance of each vertex."""
+    run, options = fit.run, fit.options
+
+    def computed(stage) -> RadiantMesh:
+        mesh = extract_mesh(volume.values, faces=options.faces)
+        found = photos.cameras
+        if options.refine_cameras > 0:
+            found = corrected(found, volume.camera_corrections())
+        if photos.masks is None:
+            mesh = without_unseen(mesh, found)
+        else:
+            mesh = outlined_mesh(mesh, photos, found, options.outlines, run.say)
+        mesh = with_atlas(mesh, options.texture, run.say)
+        grid, reflections = volume.grid(), mi.Float(volume.reflections)
+        return RadiantMesh(mesh, mean_radiance(grid, volume.features, reflections, mesh.vertices))
+
+    return run.cached("mesh", RadiantMesh, computed, title="mesh and atlas")
+
+
+@dataclass(frozen=True)
+class LitMaterial:
+    """Textures (S, S[, 3]) of a metallic-roughness material, linear: base_color, roughness,
+    metallic, normal (tangent space). f0: reflectance of its dielectric part. environment: (H, 2 H,
+    3) radiance, lat-long in the unit frame."""
+
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    normal: np.ndarray
+    f0: float
+    environment: np.ndarray
 
 
 def surface_stage(
-    bank: PixelBank, cameras, mesh: Mesh, radiance, fit: FitContext
-) -> dict[str, np.ndarray]:
-    """Material and light. cameras: unit frame. What none of them sees is painted like what is next
-    to it. Returns (and keeps) base_color, roughness, metallic, normal, environment (unit frame),
-    f0."""
-    run, options, seed = fit.run, fit.options, fit.seed
-    o = surface_options(options)
-    with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
-        face, bary = rasterise_atlas(mesh, o.texture)
-        known = face >= 0
-        areas = vertex_areas(mesh)
-        guess = base_without_shading(radiance, mesh.normals, areas)
-        start = fill_gutters(interpolate(guess, mesh.faces, face, bary), known)
-        mean = float((radiance * areas[:, None]).sum() / areas.sum() / 3)
-        normals = fill_gutters(interpolate(mesh.normals, mesh.faces, face, bary), known)
-        reflecting = radiance * (0.0 if "interreflection" in options.without else 1.0)
-        traced = TraceableMesh(mesh, reflecting)
-        metallic, roughness = PAINT, None
-        if "first_material" not in options.without and stage.load("checkpoint") is None:
-            metallic, roughness = first_material(
-                bank, traced, start, known, mean, normals, o, seed, run.progress("metal or paint")
-            )
-            run.say(describe(metallic, roughness, known))
-        model = start_surface(start, known, mean, o, normals, metallic, roughness)
-        fit_surface(EnvironmentTerms(bank, traced, model, o, seed), stage)
-        base, roughness, metallic = pictures(model.material)
-        paint = {"base_color": base, "roughness": roughness, "metallic": metallic}
-        paint = painted_over(
-            mesh,
-            seen_faces(mesh, cameras),
-            {n: fill_gutters(t, known) for n, t in paint.items()},
-            face,
-            bary,
+    bank: PixelBank, cameras: list[Camera], shaped: RadiantMesh, fit: FitContext
+) -> LitMaterial:
+    """Material and light. cameras: unit frame. Texels that no camera sees continue the seen ones."""
+    o = surface_options(fit.options)
+
+    def computed(stage) -> LitMaterial:
+        texels = texels_of(shaped.mesh, o.texture)
+        model, traced = start_of_surface(bank, shaped, texels, stage, fit)
+        fit_surface(EnvironmentTerms(bank, traced, model, o, fit.seed), stage)
+        names = ("base_color", "roughness", "metallic")
+        paint = dict(zip(names, pictures(model.material), strict=True))
+        return LitMaterial(
+            **texels.painted(paint, seen_faces(shaped.mesh, cameras)),
+            normal=normal_map(model.material),
+            f0=float(model.material.f0),
+            environment=model.environment.image(),
         )
-        maps = {
-            **paint,
-            "environment": model.environment.image(),
-            "normal": normal_map(model.material),
-            "f0": np.array(model.material.f0),
-        }
-        stage.save("maps", **maps)
-    return maps
+
+    title = "material and light (surface pass)"
+    return fit.run.cached("surface", LitMaterial, computed, steps=o.steps, title=title)
 
 
-def assemble(capture: Capture, mesh: Mesh, maps: dict[str, np.ndarray], poses=None) -> Asset:
-    """The asset in the frame of the user's cameras (`placed_mesh`).
+def start_of_surface(
+    bank: PixelBank, shaped: RadiantMesh, texels: TexelMap, stage, fit: FitContext
+) -> tuple[SurfaceModel, TraceableMesh]:
+    """The material and light that the surface pass begins with, and the mesh that rays are traced
+    through."""
+    run, options, o = fit.run, fit.options, surface_options(fit.options)
+    mesh, radiance = shaped.mesh, shaped.radiance
+    known, areas = texels.known, vertex_areas(mesh)
+    start = texels.spread(base_without_shading(radiance, mesh.normals, areas))
+    mean = float((radiance * areas[:, None]).sum() / areas.sum() / 3)
+    normals = texels.spread(mesh.normals)
+    reflecting = radiance * (0.0 if "interreflection" in options.without else 1.0)
+    traced = TraceableMesh(mesh, reflecting)
+    metallic, roughness = PAINT, None
+    if "first_material" not in options.without and stage.load("checkpoint") is None:
+        progress = run.progress("metal or paint")
+        metallic, roughness = first_material(
+            bank, traced, start, known, mean, normals, o, fit.seed, progress
+        )
+        run.say(describe(metallic, roughness, known))
+    return start_surface(start, known, mean, o, normals, metallic, roughness), traced
 
-    poses: world_from_camera (4, 4) of each photo where the cameras were refined.
-    """
+
+def assemble(
+    capture: Capture, mesh: Mesh, maps: LitMaterial, refined: list[Camera] | None
+) -> Asset:
+    """The asset in the frame of the user's cameras (`placed_mesh`). refined: cameras of the photos
+    (unit frame), None where they are as given."""
     placed, world_from_asset = placed_mesh(capture, mesh)
-    material = Material(
-        maps["base_color"], maps["roughness"], maps["metallic"], normal=maps["normal"]
-    )
-    poses = [p.camera.world_from_camera for p in capture.photos] if poses is None else poses
-    cameras = tuple(
-        (p.name, p.camera.with_pose(pose)) for p, pose in zip(capture.photos, poses, strict=True)
-    )
-    return Asset(placed, material, world_from_asset, maps["environment"], cameras, {})
+    material = Material(maps.base_color, maps.roughness, maps.metallic, normal=maps.normal)
+    cameras = [p.camera for p in capture.photos]
+    if refined is not None:
+        to_world = capture.sphere.world_from_unit
+        poses = [move_pose(to_world, c.world_from_camera) for c in refined]
+        cameras = [c.with_pose(pose) for c, pose in zip(cameras, poses, strict=True)]
+    named = tuple((p.name, c) for p, c in zip(capture.photos, cameras, strict=True))
+    return Asset(placed, material, world_from_asset, maps.environment, named, {})
 
 
 RECIPE = Recipe(

@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from relit.conventions import move_pose
-from relit.fit.passes.pixels import make_bank
-from relit.scene import Capture
+from relit.fit.passes.pixels import PixelBank, make_bank
+from relit.scene import Camera, Capture
 
 
-def load_pixels(capture: Capture, options, run):
-    """Decode all photos: the pixel bank, cameras (unit frame), masks or None, mean radiance of the
-    object (3,). options: of the recipe, of which max_pixels counts."""
+@dataclass(frozen=True)
+class UnitPhotos:
+    """Photos as the passes use them. bank: their pixels on the device. cameras: in the unit frame.
+    masks: (h, w) float32 in [0, 1] each, or None where they are not known. level: (3,) mean
+    radiance of the object. names: as messages show them."""
+
+    bank: PixelBank
+    cameras: list[Camera]
+    masks: list[np.ndarray] | None
+    level: np.ndarray
+    names: list[str]
+
+
+def load_pixels(capture: Capture, options, run) -> UnitPhotos:
+    """Decode all photos and carry their cameras to the unit frame. options: of the recipe, of which
+    max_pixels counts."""
     unit_from_world = np.linalg.inv(capture.sphere.world_from_unit)
     total = sum(p.width * p.height for p in capture.photos)
     shrink = min(1.0, np.sqrt(options.max_pixels / total))
@@ -47,7 +62,8 @@ def load_pixels(capture: Capture, options, run):
     ) / max(weight, 1e-6)
     prior = normals if any(n is not None for n in normals) else None
     bank = make_bank(cameras, images, masks, prior, whites)
-    return bank, cameras, masks if masked else None, np.maximum(level, 1e-3)
+    names = [photo.name for photo in capture.photos]
+    return UnitPhotos(bank, cameras, masks if masked else None, np.maximum(level, 1e-3), names)
 
 
 def resize(image, width: int, height: int):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -10,11 +10,13 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from relit.geometry.se3 import exp_so3
+from relit.fit.passes.camera_corrections import (
+    CameraCorrections,
+    no_corrections,
+)
 from relit.scene import Camera
 
 SATURATED = 0.99  # of photos whose values end at 1
-CAMERA_FLOATS = 16  # fx fy cx cy, then the 3x4 pose row by row
 
 
 @dataclass
@@ -22,9 +24,8 @@ class PixelBank:
     """views, total: counts of photos and pixels. rgbm: Float [total * 4], linear RGB and mask.
     normals: Float [total * 4] or None (camera axes, last entry 1 where known). cameras: Float
     [views * 16]. offsets, widths: UInt32 [views]. candidates: UInt32, the pixels that batches are
-    drawn from. masked: whether masks are known. corrections: Float [views * 6] (rotation vector,
-    translation) or [views * 7] or [views * 8] (see `rays_through`). saturated: see `saturation`; a
-    float, or Float [views] where photos differ.
+    drawn from. masked: whether masks are known. corrections: of the cameras. saturated: see
+    `saturation`; a float, or Float [views] where photos differ.
     drop_saturated: whether such pixels have no say in the volume pass."""
 
     views: int
@@ -36,7 +37,7 @@ class PixelBank:
     widths: Any
     candidates: Any
     masked: bool
-    corrections: Any
+    corrections: CameraCorrections
     saturated: Any = SATURATED
     drop_saturated: bool = False
 
@@ -111,7 +112,7 @@ def make_bank(
         mi.UInt32(np.array([im.shape[1] for im in images], np.uint32)),
         mi.UInt32(np.concatenate(candidates)),
         masked,
-        dr.zeros(mi.Float, 6 * len(images)),
+        no_corrections(len(images)),
         saturation(images, whites or [None] * len(images)),
     )
 
@@ -165,75 +166,24 @@ def sphere_pixels(camera: Camera, radius: float) -> np.ndarray:
     return (b * b - (o @ o - radius * radius) > 0) & ((-b + radius) > 0)
 
 
-def rays_through(cameras, view, x, y, corrections=None):
+def rays_through(cameras, view, x, y, corrections: CameraCorrections | None = None):
     """Rays (o, d) through pixel positions x, y (Floats in pixels, centres at +.5) of `view`;
-    differentiable in `corrections`.
-
-    A correction turns the camera about its own centre by exp(hat(rotation vector)) and moves it by
-    the translation, both in the unit frame. Where corrections have seven numbers a view, the camera
-    turns about the ORIGIN of the unit frame (a viewpoint that is wrong is put right without moving
-    the picture), then moves, and the seventh is the logarithm of a factor on the focal lengths and
-    on the distance from the origin together (what stands there keeps its size in the picture; only
-    the perspective changes). An eighth is the
-    logarithm of a factor on the distance alone: among the translations, which are in the axes of
-    the unit frame, it would be lost beside what moves the picture aside.
-    """
+    differentiable in the values of `corrections`."""
     k = [dr.gather(mi.Vector4f, cameras, view * 4 + j) for j in range(4)]
     lx, ly = (x - k[0].z) / k[0].x, (y - k[0].w) / k[0].y
-    each = 6 if corrections is None else dr.width(corrections) * CAMERA_FLOATS // dr.width(cameras)
-    if each > 6:
-        zoom = dr.exp(-dr.gather(mi.Float, corrections, view * each + 6))
-        lx, ly = lx * zoom, ly * zoom
-    d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
     o = mi.Vector3f(k[1].w, k[2].w, k[3].w)
     if corrections is not None:
-        c = [dr.gather(mi.Float, corrections, view * each + j) for j in range(6)]
-        w = mi.Vector3f(c[0], c[1], c[2])
-        theta2 = dr.squared_norm(
-            w
-        )  # Rodrigues' formula by its series, right to 1e-6 for corrections below half a radian
-
-        def turn(v):
-            turned = dr.cross(w, v)
-            return (
-                v
-                + (1 - theta2 / 6 * (1 - theta2 / 20)) * turned
-                + (0.5 - theta2 / 24 * (1 - theta2 / 30)) * dr.cross(w, turned)
-            )
-
-        d, o = turn(d), turn(o) / zoom if each > 6 else o
-        if each > 7:
-            o = o * dr.exp(dr.gather(mi.Float, corrections, view * each + 7))
-        o = o + mi.Vector3f(c[3], c[4], c[5])
-    return o, d
-
-
-def corrected(cameras: list[Camera], corrections: np.ndarray) -> list[Camera]:
-    """The cameras with their corrections, (views * 6), (views * 7) or (views * 8), built in."""
-    out = []
-    for camera, c in zip(
-        cameras, np.asarray(corrections, np.float64).reshape(len(cameras), -1), strict=True
-    ):
-        pose = np.array(camera.world_from_camera, np.float64)
-        turn, zoom = exp_so3(c[:3]), 1.0
-        pose[:3, :3] = turn @ pose[:3, :3]
-        if len(c) > 6:
-            zoom = float(np.exp(c[6]))
-            pose[:3, 3] = zoom * (turn @ pose[:3, 3])
-        if len(c) > 7:
-            pose[:3, 3] *= np.exp(c[7])
-        pose[:3, 3] += c[3:6]
-        out.append(
-            replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom, world_from_camera=pose)
-        )
-    return out
+        shrink = corrections.inverse_zoom(view)
+        lx, ly = lx * shrink, ly * shrink
+    d = dr.normalize(mi.Vector3f(*[k[j].x * lx + k[j].y * ly + k[j].z for j in (1, 2, 3)]))
+    return (o, d) if corrections is None else corrections.moved(view, o, d)
 
 
 def place_cameras(bank: PixelBank, cameras: list[Camera]) -> None:
     """Let the bank's rays come from `cameras`, without corrections."""
     bank.cameras, bank.corrections = (
         mi.Float(camera_rows(cameras)),
-        dr.zeros(mi.Float, 6 * bank.views),
+        no_corrections(bank.views),
     )
 
 
@@ -253,7 +203,7 @@ def locate(bank: PixelBank, pixel):
     return view, local - row * width, row
 
 
-def batch_of(bank: PixelBank, pixel, corrections=None) -> RayBatch:
+def batch_of(bank: PixelBank, pixel, corrections: CameraCorrections | None = None) -> RayBatch:
     """Rays and targets of flat pixel numbers (UInt32)."""
     view, x, y = locate(bank, pixel)
     o, d = rays_through(bank.cameras, view, mi.Float(x) + 0.5, mi.Float(y) + 0.5, corrections)

@@ -10,14 +10,18 @@ surface.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from relit.fit.passes.camera_corrections import without_common_motion
+from relit.fit.passes.camera_corrections import (
+    CameraCorrections,
+    CorrectionModel,
+    without_common_motion,
+)
 from relit.fit.passes.losses import display_loss, mask_loss, normal_loss
 from relit.fit.passes.optimiser import Adam, cosine_decay, memory, recall, run_steps
 from relit.fit.passes.pixels import (
@@ -43,6 +47,7 @@ from relit.geometry.sdf import (
     smoothness_gradient,
     write_rows,
 )
+from relit.records import from_arrays, to_arrays
 from relit.rendering.appearance.fixed_light import (
     CHANNELS,
     shade,
@@ -98,6 +103,9 @@ class VolumeModel:
     normal Vector3f); `reflections` is then whatever flat Float it learns, each entry with its own
     rate, `rates` (Float, or a function of the step that gives it; times 0.06).
 
+    correction_ratios: factors on the rate of the camera corrections, Float as wide as they are, or
+    None for 1.
+
     mirrored: rays that bound the shape besides, mirrored (fit/duplicates/mirrored_silhouettes.py's
     MirroredRays), or None."""
 
@@ -105,7 +113,7 @@ class VolumeModel:
     reflections: Any
     background: Background | None
     inv_s: float = 0.0
-    extra: dict[str, Any] = field(default_factory=dict)
+    correction_ratios: Any = None
     appearance: Callable | None = None
     rates: Any = 1.0
     mirrored: Any = None
@@ -117,6 +125,46 @@ class VolumeModel:
             if self.appearance is None
             else self.appearance(m, rays, cameras, self.reflections)
         )
+
+
+@dataclass(frozen=True)
+class VolumeResult:
+    """What a volume pass ends with, and what its checkpoints keep.
+
+    values: (n, n, n) float32 distances, in units of the unit frame. features: (R, C) float32, a row
+    for each optimised node, row 0 for all others. nodes: (R - 1,) uint32, flat numbers of the
+    optimised nodes. reflections: see `VolumeModel`. corrections: (views, k) float32 of the cameras,
+    as correction_model has them. inv_s: sharpness of the surface (NeuS). background: cells of the background field, or None.
+    """
+
+    values: np.ndarray
+    features: np.ndarray
+    nodes: np.ndarray
+    reflections: np.ndarray
+    corrections: np.ndarray
+    correction_model: CorrectionModel
+    inv_s: float
+    background: np.ndarray | None = None
+
+    def camera_corrections(self) -> CameraCorrections:
+        """The corrections on the device."""
+        return CameraCorrections(self.correction_model, mi.Float(self.corrections.ravel()))
+
+    def grid(self) -> SdfGrid:
+        """The distances and features on the device."""
+        n = self.values.shape[0]
+        grid = make_grid(self.values, CHANNELS, band=np.inf)
+        index = np.zeros(n**3, np.uint32)
+        index[self.nodes] = np.arange(1, len(self.nodes) + 1, dtype=np.uint32)
+        grid.index, grid.nodes, grid.rows = (
+            mi.UInt32(index),
+            mi.UInt32(self.nodes),
+            len(self.nodes) + 1,
+        )
+        inside = self.values.ravel()[self.nodes]
+        grid.row_values = mi.Float(np.concatenate([[1.0], inside]).astype(np.float32))
+        grid.features = mi.Float(self.features.ravel())
+        return grid
 
 
 def start_model(
@@ -174,13 +222,13 @@ def fit_volume(
     done = 0
     saved = stage.load("checkpoint")
     start = int(saved["step"]) if saved else 0
-    camera_adam = Adam(dr.width(bank.corrections))
+    camera_adam = Adam(dr.width(bank.corrections.values))
     for number, (n, steps) in enumerate(zip(options.levels, options.steps, strict=False)):
         if start >= done + steps and number + 1 < len(options.levels):
             done += steps
             continue
         if saved and start > done:
-            restore_model(model, bank, saved)
+            restore_model(model, bank, from_arrays(VolumeResult, saved))
         elif model.grid.n != n:
             next_level(model, n, options.band, mend if number == 1 else None)
         if start >= done + steps:
@@ -194,7 +242,7 @@ def fit_volume(
         )
         done += steps
     stage.save(
-        "checkpoint", step=done, **_state(model, bank)
+        "checkpoint", step=done, **to_arrays(volume_result(model, bank))
     )  # a stop during the mesh stage need not come back here
     return model
 
@@ -204,7 +252,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, m
     h, count = grid.h, options.rays
     rng = mi.PCG32(size=count, initstate=seed * 7919 + begin)
     refine = options.refine_cameras > 0 and end > options.hold
-    ratios = model.extra.get("correction_rates")  # Float as wide as the corrections
+    ratios = model.correction_ratios
     # cameras that stay tell where the scene is
     held = ratios is not None and not np.array(ratios).reshape(bank.views, -1).any(axis=1).all()
     adam = {
@@ -230,7 +278,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, m
         if model.background is not None:
             params.append(model.background.cells)
         if refine:
-            params.append(bank.corrections)
+            params.append(bank.corrections.values)
         dr.enable_grad(*params)
 
         pixel = draw_pixels(bank, rng, count)
@@ -302,15 +350,19 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, m
         if refine:
             rate = options.refine_cameras * decay if i >= options.hold else 0.0
             moved = camera_adam.step(
-                dr.detach(bank.corrections), gradients[-1], rate, 1.0 if ratios is None else ratios
+                dr.detach(bank.corrections.values),
+                gradients[-1],
+                rate,
+                1.0 if ratios is None else ratios,
             )
-            bank.corrections = moved if held else without_common_motion(moved, bank.cameras)
+            free = CameraCorrections(bank.corrections.model, moved)
+            bank.corrections = free if held else without_common_motion(free, bank.cameras)
         dr.eval(grid.row_values)
         write_rows(grid)
         return report
 
     corrections = (lambda: bank.corrections) if refine else None
-    state = lambda: {**_state(model, bank), **memory(rng, adam)}  # noqa: E731
+    state = lambda: {**to_arrays(volume_result(model, bank)), **memory(rng, adam)}  # noqa: E731
     run_steps(
         stage,
         first,
@@ -345,41 +397,26 @@ def render_views(model: VolumeModel, cameras: list[Camera], step: float = 0.9) -
     return pictures
 
 
-def _state(model: VolumeModel, bank: PixelBank) -> dict[str, np.ndarray]:
-    grid = model.grid
-    out = {
-        "values": dense_values(grid),
-        "features": row_features(grid),
-        "nodes": np.array(grid.nodes),
-        "reflections": np.array(model.reflections),
-        "corrections": np.array(bank.corrections),
-        "inv_s": np.array(model.inv_s),
-    }
-    if model.background is not None:
-        out["background"] = np.array(model.background.cells)
-    return out
+def volume_result(model: VolumeModel, bank: PixelBank) -> VolumeResult:
+    """The state of the pass as arrays."""
+    grid, background = model.grid, model.background
+    return VolumeResult(
+        values=dense_values(grid),
+        features=row_features(grid),
+        nodes=np.array(grid.nodes),
+        reflections=np.array(model.reflections),
+        corrections=bank.corrections.numbers,
+        correction_model=bank.corrections.model,
+        inv_s=float(model.inv_s),
+        background=None if background is None else np.array(background.cells),
+    )
 
 
-def restore_model(model: VolumeModel, bank: PixelBank, saved: dict[str, np.ndarray]) -> None:
-    """Put a checkpoint's arrays into the model and the bank."""
-    values, n = saved["values"], saved["values"].shape[0]
-    features = np.zeros((n**3, CHANNELS), np.float32)
-    features[saved["nodes"]] = saved["features"][1:]
-    grid = make_grid(values, CHANNELS, band=np.inf)
-    index = np.zeros(n**3, np.uint32)
-    index[saved["nodes"]] = np.arange(1, len(saved["nodes"]) + 1, dtype=np.uint32)
-    grid.index, grid.nodes, grid.rows = (
-        mi.UInt32(index),
-        mi.UInt32(saved["nodes"]),
-        len(saved["nodes"]) + 1,
-    )
-    grid.row_values = mi.Float(
-        np.concatenate([[1.0], values.ravel()[saved["nodes"]]]).astype(np.float32)
-    )
-    grid.features = mi.Float(saved["features"].ravel())
-    model.grid = grid
-    model.reflections = mi.Float(saved["reflections"])
-    bank.corrections = mi.Float(saved["corrections"])
-    model.inv_s = float(saved["inv_s"])
+def restore_model(model: VolumeModel, bank: PixelBank, state: VolumeResult) -> None:
+    """Inverse of `volume_result`: put the arrays into the model and the bank."""
+    model.grid = state.grid()
+    model.reflections = mi.Float(state.reflections)
+    bank.corrections = state.camera_corrections()
+    model.inv_s = state.inv_s
     if model.background is not None:
-        model.background.cells = mi.Float(saved["background"])
+        model.background.cells = mi.Float(state.background)

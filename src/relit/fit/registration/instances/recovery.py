@@ -228,12 +228,16 @@ def refine_candidates(
     )
     appearance = shade_world if turns is None else partial(shade_world, turns=turns(views))
     still = replace(
-        model, reflections=mi.Float(learnt), rates=mi.Float(rates), appearance=appearance, extra={}
+        model,
+        reflections=mi.Float(learnt),
+        rates=mi.Float(rates),
+        appearance=appearance,
+        correction_ratios=None,
     )
     move_poses(bank, still)
-    moves = np.array(still.extra["correction_rates"]).reshape(-1, 8)
+    moves = np.array(still.correction_ratios).reshape(-1, 8)
     moves[0] = 0
-    still.extra["correction_rates"] = mi.Float(moves.ravel())
+    still.correction_ratios = mi.Float(moves.ravel())
     sharp = model.inv_s * model.grid.h
     frozen = {
         "sdf_rate": 0.0,

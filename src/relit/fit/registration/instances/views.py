@@ -19,14 +19,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import cv2
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from relit.conventions import similarity
+from relit.fit.passes.camera_corrections import CorrectionModel, corrected, no_corrections
 from relit.fit.passes.optimiser import NoStage
-from relit.fit.passes.pixels import PixelBank, corrected, make_bank
+from relit.fit.passes.pixels import PixelBank, make_bank
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.fit.registration.register import Crop, Render, crop_photo, volume_render
 from relit.geometry.hull import distance_of
@@ -305,8 +305,8 @@ def move_poses(bank: PixelBank, model: VolumeModel, distances: bool = True) -> N
     """Let the volume pass turn the cameras about the object's middle (not about themselves, which
     would throw the picture aside), move them, and change their distance, if asked to; the focal
     length stays."""
-    bank.corrections = dr.zeros(mi.Float, 8 * bank.views)
-    model.extra["correction_rates"] = mi.Float(
+    bank.corrections = no_corrections(bank.views, CorrectionModel.WITH_DISTANCE)
+    model.correction_ratios = mi.Float(
         np.tile(np.array([1, 1, 1, 1, 1, 1, 0, distances], np.float32), bank.views)
     )
 
@@ -314,16 +314,16 @@ def move_poses(bank: PixelBank, model: VolumeModel, distances: bool = True) -> N
 def hold_distances(model: VolumeModel) -> None:
     """Change the distances of `move_poses` no more. On a fine grid their steps shake the size of
     every instance, and turns suffer."""
-    rates = np.array(model.extra["correction_rates"]).reshape(-1, 8)
+    rates = np.array(model.correction_ratios).reshape(-1, 8)
     rates[:, 7] = 0
-    model.extra["correction_rates"] = mi.Float(rates.ravel())
+    model.correction_ratios = mi.Float(rates.ravel())
 
 
 def moved_poses(bank: PixelBank, views: list[InstanceView], poses: np.ndarray) -> np.ndarray:
     """The poses (N, 4, 4) with the corrections that a fit has found."""
     cameras = corrected(
         [v.camera.with_pose(p) for v, p in zip(views, poses, strict=True)],
-        np.array(bank.corrections),
+        bank.corrections,
     )
     return np.array([c.world_from_camera for c in cameras])
 

@@ -14,13 +14,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from relit.conventions import similarity
+from relit.fit.passes.camera_corrections import CorrectionModel, corrected, no_corrections
 from relit.fit.passes.optimiser import NoStage
-from relit.fit.passes.pixels import corrected
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.fit.registration.photos.depth import depth_limit
 from relit.fit.registration.photos.framing import crop_bank, is_cut, not_empty
@@ -271,9 +270,9 @@ def fit_with_free_poses(
     model.reflections, model.rates = start_photo_lights(np.full((len(crops), 3), GREY), GREY)
     model.appearance = shade_photos
     bank = crop_bank(crops, cameras)
-    bank.corrections = dr.zeros(mi.Float, 7 * bank.views)
+    bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
     if held is not None:
-        model.extra["correction_rates"] = mi.Float(np.repeat(1.0 - np.asarray(held, np.float32), 7))
+        model.correction_ratios = mi.Float(np.repeat(1.0 - np.asarray(held, np.float32), 7))
     options = VolumeOptions(
         (nodes,),
         (steps,),
@@ -284,9 +283,9 @@ def fit_with_free_poses(
         refine_cameras=0.005,
     )
     fit_volume(bank, model, options, stage or NoStage(), seed)
-    numbers = np.array(bank.corrections).reshape(-1, 7)
+    numbers = bank.corrections.numbers
     numbers[:, 6] = 0
-    found = corrected(cameras, numbers.ravel())
+    found = corrected(cameras, replace(bank.corrections, values=mi.Float(numbers.ravel())))
     moved = [
         c.world_from_camera @ np.linalg.inv(crop.camera.world_from_camera)
         for c, crop in zip(found, crops, strict=True)

@@ -1,0 +1,80 @@
+"""From distances to a textured mesh: outlines, atlas, and what lies on each texel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from relit.fit.passes.load_photos import UnitPhotos
+from relit.fit.shape.inpaint import painted_over
+from relit.fit.shape.odd_photos import check_masks
+from relit.fit.shape.outlines import follow_outlines
+from relit.geometry.atlas import unwrap
+from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
+from relit.scene import Camera, Mesh
+
+
+def outlined_mesh(
+    mesh: Mesh,
+    photos: UnitPhotos,
+    cameras: Sequence[Camera],
+    rounds: int,
+    say: Callable[[str], None],
+) -> Mesh:
+    """The mesh after `rounds` rounds in which its outlines follow the masks. cameras: those of the
+    photos, as the mesh has them. Photos whose masks it does not fill are named; raises UserError
+    where it fills hardly any."""
+    mesh = follow_outlines(mesh, cameras, photos.masks, rounds)
+    if note := check_masks(mesh, cameras, photos.masks, photos.names):
+        say(note)
+    return mesh
+
+
+def with_atlas(mesh: Mesh, size: int, say: Callable[[str], None]) -> Mesh:
+    """The mesh with texture coordinates, for textures of `size` texels a side."""
+    mesh, how = unwrap(mesh, size)
+    if how != "xatlas":
+        say(
+            "note: the mesh was too difficult for charts; its atlas has one cell for every two faces"
+        )
+    return mesh
+
+
+@dataclass(frozen=True)
+class TexelMap:
+    """Where the texels of an atlas lie on its mesh. face: (S, S) int32, -1 where there is none.
+    bary: (S, S, 3) float32 barycentric coordinates."""
+
+    mesh: Mesh
+    face: np.ndarray
+    bary: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """(S, S) bool: texels that lie on a face."""
+        return self.face >= 0
+
+    def on_faces(self, values: np.ndarray) -> np.ndarray:
+        """(S, S, C) of vertex values (V, C); 0 where there is no face."""
+        return interpolate(values, self.mesh.faces, self.face, self.bary)
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """(S, S, C) of vertex values (V, C), gutters filled."""
+        return self.filled(self.on_faces(values))
+
+    def filled(self, texture: np.ndarray) -> np.ndarray:
+        """The texture with its gutters filled."""
+        return fill_gutters(texture, self.known)
+
+    def painted(self, textures: dict[str, np.ndarray], seen: np.ndarray) -> dict[str, np.ndarray]:
+        """The textures with gutters filled, and with the texels of faces that are not `seen` (F,)
+        continued from those that are."""
+        filled = {name: self.filled(texture) for name, texture in textures.items()}
+        return painted_over(self.mesh, seen, filled, self.face, self.bary)
+
+
+def texels_of(mesh: Mesh, size: int) -> TexelMap:
+    """The texels of an atlas of `size` texels a side."""
+    return TexelMap(mesh, *rasterise_atlas(mesh, size))
