@@ -9,9 +9,12 @@ import mitsuba as mi
 import numpy as np
 
 from relit.fit.collection.options import CollectionOptions
-from relit.fit.collection.photos import CollectionPhoto, collection_crops
+from relit.fit.collection.photos import CollectionPhoto, PhotoSet, collection_crops
+from relit.fit.collection.shape import FittedShape
 from relit.fit.collection.surface import (
+    AlbedoMesh,
     PhotoLightTerms,
+    PhotoLitMaterial,
     fit_collection_surface,
     light_family,
     light_options,
@@ -42,7 +45,7 @@ from relit.fit.registration.register import (
     views_from,
     volume_render,
 )
-from relit.geometry.mesh import extract_mesh, vertex_areas
+from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import rotation_angle
 from relit.lighting.per_photo import COLUMNS, ROWS
@@ -50,8 +53,7 @@ from relit.materials.field import start_material
 from relit.recipe import FitContext
 from relit.rendering.appearance.light_per_photo import shade_photos, shade_plain, start_photo_lights
 from relit.rendering.transport import TraceableMesh
-from relit.run import run_arrays
-from relit.scene import Camera
+from relit.scene import Camera, Mesh
 
 AGAIN = 600  # viewpoints that a finished model is looked at from
 CHOICES = 6  # places of each photo that are looked into
@@ -66,57 +68,83 @@ WORSE = 0.06  # by which the score of a place may be lower for fine detail to de
 GAIN = 0.03
 
 
-def held_out_stage(
-    held, shots, model: VolumeModel, mesh, albedo, maps, cameras, degrees, fit: FitContext
-):
-    """(cameras, lights (H, ROWS, COLUMNS, 3)) of the held-out photos: registered by rendering and
-    by what the others (`shots`, their `cameras`) show, descended, lit; model and material stay."""
-    run, options, seed = fit.run, fit.options, fit.seed
-    if not held:
-        return [], np.zeros((0, ROWS, COLUMNS, 3), np.float32)
-    if run.done("held_out"):
-        kept = run_arrays(run, "held_out", "photos")
-    else:
-        with run.stage(
-            "held_out", steps=options.frozen_steps, title="photos that were set aside"
-        ) as stage:
-            new = [replace(s, camera=with_median_field(s, cameras)) for s in held]
-            found = register_held_out(new, model, degrees, options, seed)
-            found = refine_held_out_cameras(new, found, model, options, seed, LONGER)
-            found = told_by_others(new, found, shots, cameras, mesh, model, degrees, options, seed)
-            bank = make_bank(found, [s.rgb for s in new], [s.mask for s in new])
-            size = maps["roughness"].shape[0]
-            material = start_material(size, maps["base_color"], 0.5, 0.0)
-            material.colour = mi.Float(
-                np.concatenate([maps["base_color"], maps["roughness"][..., None]], -1)
-                .astype(np.float32)
-                .ravel()
-            )
-            material.metallic = mi.Float(maps["metallic"].astype(np.float32).ravel())
-            n = maps["normal"]
-            material.slope = mi.Float(
-                (n[..., :2] / np.maximum(n[..., 2:], 0.1)).astype(np.float32).ravel()
-            )
-            lit = start_collection_surface(
-                material, np.array([s.tint for s in new]), ALBEDO_START, light_family(options)
-            )
-            areas = vertex_areas(mesh)
-            scale = ALBEDO_START / float((albedo * areas[:, None]).sum() / areas.sum() / 3)
-            o = SurfaceOptions(options.frozen_steps, options.points, options.directions, size)
-            traced = TraceableMesh(mesh, albedo * scale)
-            terms = PhotoLightTerms(bank, traced, lit, o, light_options(options), frozen=True)
-            fit_collection_surface(terms, stage, seed)
-            kept = {
-                "poses": np.array([c.world_from_camera for c in found]),
-                "focal": np.array([c.fx for c in found]),
-                "lights": np.exp(lit.lights()).reshape(-1, ROWS, COLUMNS, 3),
-            }
-            stage.save("photos", **kept)
-    found = [
-        replace(s.camera, fx=f, fy=f, world_from_camera=p)
-        for s, f, p in zip(held, kept["focal"], kept["poses"], strict=True)
+@dataclass(frozen=True)
+class HeldOutPhotos:
+    """poses: (H, 4, 4) world_from_camera. focal: (H,) pixels. lights: (H, ROWS, COLUMNS, 3)."""
+
+    poses: np.ndarray
+    focal: np.ndarray
+    lights: np.ndarray
+
+    def cameras(self, held: list[CollectionPhoto]) -> list[Camera]:
+        """Their cameras."""
+        return with_poses_and_focals([s.camera for s in held], self.poses, self.focal)
+
+
+def with_poses_and_focals(
+    cameras: list[Camera], poses: np.ndarray, focal: np.ndarray
+) -> list[Camera]:
+    """The cameras with poses (N, 4, 4) and focal lengths (N,), pixels, in place of their own."""
+    return [
+        replace(c, fx=f, fy=f, world_from_camera=p)
+        for c, f, p in zip(cameras, focal, poses, strict=True)
     ]
-    return found, kept["lights"]
+
+
+def held_out_stage(
+    shape: FittedShape,
+    photos: PhotoSet,
+    colours: AlbedoMesh,
+    maps: PhotoLitMaterial,
+    fit: FitContext,
+) -> HeldOutPhotos:
+    """Cameras and lights of the photos that were set aside: registered by rendering and by what the
+    other photos show, descended, lit; shape and material stay."""
+    steps, held, model = fit.options.frozen_steps, photos.held, shape.model
+    if not held:
+        none = np.zeros((0, ROWS, COLUMNS, 3), np.float32)
+        return HeldOutPhotos(np.zeros((0, 4, 4)), np.zeros(0), none)
+
+    def computed(stage) -> HeldOutPhotos:
+        new = [replace(s, camera=with_median_field(s, shape.cameras)) for s in held]
+        found = register_held_out(new, model, photos.degrees, fit.options, fit.seed)
+        found = refine_held_out_cameras(new, found, model, fit.options, fit.seed, LONGER)
+        found = told_by_others(new, found, shape, photos, colours.mesh, fit)
+        return HeldOutPhotos(
+            poses=np.array([c.world_from_camera for c in found]),
+            focal=np.array([c.fx for c in found]),
+            lights=lights_of(new, found, colours, maps, stage, fit),
+        )
+
+    title = "photos that were set aside"
+    return fit.run.cached("held_out", HeldOutPhotos, computed, steps=steps, title=title)
+
+
+def lights_of(
+    shots: list[CollectionPhoto],
+    cameras: list[Camera],
+    colours: AlbedoMesh,
+    maps: PhotoLitMaterial,
+    stage,
+    fit: FitContext,
+) -> np.ndarray:
+    """(N, ROWS, COLUMNS, 3) radiance of each photo's light under a finished material."""
+    options, size = fit.options, maps.roughness.shape[0]
+    bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
+    material = start_material(size, maps.base_color, 0.5, 0.0)
+    material.colour = mi.Float(
+        np.concatenate([maps.base_color, maps.roughness[..., None]], -1).astype(np.float32).ravel()
+    )
+    material.metallic = mi.Float(maps.metallic.astype(np.float32).ravel())
+    n = maps.normal
+    material.slope = mi.Float((n[..., :2] / np.maximum(n[..., 2:], 0.1)).astype(np.float32).ravel())
+    tints = np.array([s.tint for s in shots])
+    lit = start_collection_surface(material, tints, ALBEDO_START, light_family(options))
+    o = SurfaceOptions(options.frozen_steps, options.points, options.directions, size)
+    traced = TraceableMesh(colours.mesh, colours.albedo * colours.scale)
+    terms = PhotoLightTerms(bank, traced, lit, o, light_options(options), frozen=True)
+    fit_collection_surface(terms, stage, fit.seed)
+    return np.exp(lit.lights()).reshape(-1, ROWS, COLUMNS, 3)
 
 
 def with_median_field(shot: CollectionPhoto, cameras: list[Camera]) -> Camera:
@@ -171,76 +199,76 @@ def register_held_out(
 
 
 def told_by_others(
-    new,
+    new: list[CollectionPhoto],
     found: list[Camera],
-    shots,
-    cameras,
-    mesh,
-    model: VolumeModel,
-    degrees,
-    options: CollectionOptions,
-    seed: int,
-):
-    """The cameras `found` of `new` photos, but for those that from elsewhere show more of what
-    `shots` show there."""
-    places = far_from(
-        found, other_places(new, found, model, degrees, np.zeros(len(new), bool), options, seed)
-    )
+    shape: FittedShape,
+    photos: PhotoSet,
+    mesh: Mesh,
+    fit: FitContext,
+) -> list[Camera]:
+    """The cameras `found` of `new` photos, but for those that from elsewhere show more of what the
+    other photos show there."""
+    still = np.zeros(len(new), bool)
+    degrees, options, seed = photos.degrees, fit.options, fit.seed
+    places = far_from(found, other_places(new, found, shape.model, degrees, still, options, seed))
     if not places:
         return found
     surface = surface_of(mesh)
     laid = np.array(
         [
             photo_values_at(surface, c, detail_of(s.rgb, s.mask))
-            for c, s in zip(cameras, shots, strict=True)
+            for c, s in zip(shape.cameras, photos.shots, strict=True)
         ]
     )
-    told = compare_detail(
-        surface, [detail_of(s.rgb, s.mask) for s in new], found, places, laid
-    ).moved
-    return [told.get(i, c) for i, c in enumerate(found)]
+    pictures = [detail_of(s.rgb, s.mask) for s in new]
+    moved = compare_detail(surface, pictures, found, places, laid).moved
+    return [moved.get(i, c) for i, c in enumerate(found)]
 
 
 @dataclass(frozen=True)
 class SecondLook:
-    """cameras: of all photos. moved: numbers of the photos that moved. detail: (P,), see
-    `borne_out`. as_well: (P,) degrees by which another place, from which a photo shows about as
-    much of what the others show, is turned against its own; 0 where there is none."""
+    """poses: (P, 4, 4) and focal: (P,) pixels of all photos. moved: (M,) numbers of the photos that
+    moved. detail: (P,), see `detail_correlation`. as_well: (P,) degrees by which another place,
+    from which a photo shows about as much of what the others show, is turned against its own; 0
+    where there is none."""
 
-    cameras: list[Camera]
-    moved: list[int]
+    poses: np.ndarray
+    focal: np.ndarray
+    moved: np.ndarray
     detail: np.ndarray
     as_well: np.ndarray
 
+    def placed(self, cameras: list[Camera]) -> list[Camera]:
+        """The cameras at these poses."""
+        return with_poses_and_focals(cameras, self.poses, self.focal)
+
 
 def look_again(
-    shots: list[CollectionPhoto],
-    cameras: list[Camera],
-    model: VolumeModel,
-    degrees: float,
-    still,
-    options: CollectionOptions,
-    seed: int,
-):
-    """A SecondLook: every photo is searched for in the finished model, whose detail tells apart
-    what the coarse ones took for each other. Photos that fit elsewhere by GAIN move there, and so
-    do those that from elsewhere show more of what the others show there (a
-    stool from above, half a turn away: fit/registration/fine_detail.py). still: (P,) bool, photos
-    that stay."""
-    places = other_places(shots, cameras, model, degrees, still, options, seed)
+    shape: FittedShape, photos: PhotoSet, still: np.ndarray, fit: FitContext
+) -> SecondLook:
+    """Every photo is searched for in the finished model, whose detail tells apart what the coarse
+    ones took for each other. Photos that fit elsewhere by GAIN move there, and so do those that
+    from elsewhere show more of what the others show there (a stool from above, half a turn away:
+    fit/registration/fine_detail.py). still: (P,) bool, photos that stay."""
+    shots, cameras, model = photos.shots, shape.cameras, shape.model
+    places = other_places(shots, cameras, model, photos.degrees, still, fit.options, fit.seed)
     out, moved = list(cameras), {}
     for i, camera, gain in places:  # the best comes first
         if gain > GAIN and i not in moved:
             out[i] = moved[i] = camera
-    surface = surface_of(extract_mesh(dense_values(model.grid), faces=options.faces))
+    surface = surface_of(extract_mesh(dense_values(model.grid), faces=fit.options.faces))
     pictures = [detail_of(s.rgb, s.mask) for s in shots]
-    told = compare_detail(surface, pictures, out, far_from(out, places))
-    out = [told.moved.get(i, c) for i, c in enumerate(out)]
+    found = compare_detail(surface, pictures, out, far_from(out, places))
+    out = [found.moved.get(i, c) for i, c in enumerate(out)]
     turns = np.zeros(len(out))
-    for i, camera in told.as_well.items():
+    for i, camera in found.as_well.items():
         turns[i] = turn_between(out[i].world_from_camera, camera.world_from_camera)
     return SecondLook(
-        out, sorted(moved | told.moved), detail_correlation(surface, pictures, out), turns
+        poses=np.array([c.world_from_camera for c in out]),
+        focal=np.array([c.fx for c in out]),
+        moved=np.array(sorted(moved | found.moved), int),
+        detail=detail_correlation(surface, pictures, out),
+        as_well=turns,
     )
 
 

@@ -8,7 +8,8 @@ group's photos agree on where the group lies, the others are tried there too.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,7 +44,6 @@ from relit.fit.registration.register import (
     volume_render,
 )
 from relit.geometry.se3 import nearest_rotation, rotation_angle, rotation_from
-from relit.run import run_arrays
 
 BEGINS = 8  # photos of a group from which on the shape begins with it
 NEARLY_ALL, FEWEST = (
@@ -58,29 +58,29 @@ CONTRADICTED = (
 LOSS = 0.03  # of score that a photo may lose where its group wants it
 
 
-def links_stage(shots: list[CollectionPhoto], run, seed: int) -> list[Group]:
-    """Groups of linked photos, kept in the run folder: all of them where they come with cameras.
-    None where pycolmap is missing or nothing matches."""
+@dataclass(frozen=True)
+class LinkedGroups:
+    """Groups of linked photos, the largest first."""
+
+    groups: tuple[Group, ...]
+
+
+def links_stage(shots: list[CollectionPhoto], run, seed: int) -> LinkedGroups:
+    """Groups of linked photos: one of all where they come with cameras; none where pycolmap is
+    missing or nothing matches."""
     if all(s.given is not None for s in shots):
-        return [group_of_cameras(shots)]
-    names = ("photos", "poses", "focals", "points", "views")
-    if run.done("links"):
-        kept = run_arrays(run, "links", "groups")
-        return [Group(*(kept[f"{n}{i}"] for n in names)) for i in range(int(kept["count"]))]
-    with run.stage("links", title="matches between photos") as stage:
+        return LinkedGroups((group_of_cameras(shots),))
+
+    def computed(stage) -> LinkedGroups:
         try:
             load_pycolmap()
         except UserError as error:
             run.say(f"note: photos are not matched with each other: {error}")
-            groups = []
-        else:
-            groups = link_photos([_full(s) for s in shots], stage.folder / "work", seed, run.say)
-        stage.save(
-            "groups",
-            count=np.array(len(groups)),
-            **{f"{n}{i}": getattr(g, n) for i, g in enumerate(groups) for n in names},
-        )
-    return groups
+            return LinkedGroups(())
+        photos = [_full(s) for s in shots]
+        return LinkedGroups(tuple(link_photos(photos, stage.folder / "work", seed, run.say)))
+
+    return run.cached("links", LinkedGroups, computed, title="matches between photos")
 
 
 def group_of_cameras(shots: list[CollectionPhoto]) -> Group:
@@ -105,7 +105,7 @@ def _full(shot: CollectionPhoto):
     return pixels.rgb, mask, float(known or 0)
 
 
-def with_focals(shots: list[CollectionPhoto], groups: list[Group]) -> list[CollectionPhoto]:
+def with_focals(shots: list[CollectionPhoto], groups: Sequence[Group]) -> list[CollectionPhoto]:
     """The shots, those of groups with the focal length that COLMAP found."""
     out = list(shots)
     for group in groups:
@@ -162,7 +162,7 @@ def poses_of_group(
 
 def poses_from_links(
     crops: list[Crop],
-    groups: list[Group],
+    groups: Sequence[Group],
     shots: list[CollectionPhoto],
     directions: np.ndarray,
     degrees: float,
@@ -283,7 +283,9 @@ def found_in(
     return best_refined(crops, found, render, rings, keep, COARSE)
 
 
-def voted(crops: list[Crop], groups: list[Group], poses: np.ndarray, scores: np.ndarray, render):
+def voted(
+    crops: list[Crop], groups: Sequence[Group], poses: np.ndarray, scores: np.ndarray, render
+):
     """(poses, scores) after each group's vote on where it lies: a photo whose pose does not go with
     most of its group's is tried where the group wants it, and stays there unless it fits much
     worse."""

@@ -44,10 +44,27 @@ class CollectionPhoto:
         return np.maximum(self.rgb[inside].mean(0), 1e-3)
 
 
-def load_shots(
-    capture: Capture, options: CollectionOptions, run
-) -> tuple[list[CollectionPhoto], list[CollectionPhoto], float]:
-    """Training shots, held-out shots, and how many degrees the hints may be off."""
+@dataclass(frozen=True)
+class PhotoSet:
+    """The photos of a collection. shots: those that the fit uses. held: those set aside. degrees:
+    largest error of the hints."""
+
+    shots: list[CollectionPhoto]
+    held: list[CollectionPhoto]
+    degrees: float
+
+    @property
+    def tints(self) -> np.ndarray:
+        """(P, 3) mean linear colour of the object in each of `shots`."""
+        return np.array([s.tint for s in self.shots])
+
+    @property
+    def names(self) -> list[str]:
+        return [s.photo.name for s in self.shots]
+
+
+def load_shots(capture: Capture, options: CollectionOptions, run) -> PhotoSet:
+    """Decode all photos; what has no mask or camera gets a guess."""
     photos, held = list(capture.photos), list(capture.held_out)
     if options.holdout > 1 and not held:
         held = photos[options.holdout // 2 :: options.holdout]
@@ -100,7 +117,8 @@ def load_shots(
             f"only {len(training)} photos have a mask with anything in it",
             fix="give masks that are white on the object",
         )
-    return training, [s for s in kept if s.photo in held], 45.0 if hints is None else hints.degrees
+    degrees = 45.0 if hints is None else hints.degrees
+    return PhotoSet(training, [s for s in kept if s.photo in held], degrees)
 
 
 def hints_of_cameras(capture: Capture, photos: list[Photo]) -> Hints:

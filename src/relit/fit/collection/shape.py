@@ -3,23 +3,26 @@ that no silhouette shows."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
 
 from relit.errors import UserError
 from relit.fit.collection.options import CollectionOptions
-from relit.fit.collection.photos import collection_crops
+from relit.fit.collection.photo_poses import PhotoPoses
+from relit.fit.collection.photos import PhotoSet, collection_crops
 from relit.fit.passes.camera_corrections import CorrectionModel, corrected, no_corrections
 from relit.fit.passes.pixels import PixelBank, make_bank, place_cameras
 from relit.fit.passes.volume import (
     VolumeModel,
     VolumeOptions,
+    VolumeResult,
     fit_volume,
     next_level,
     restore_model,
     start_model,
+    volume_result,
 )
 from relit.fit.registration.photos.depth import depth_limit
 from relit.fit.registration.photos.few import FEW
@@ -29,7 +32,6 @@ from relit.fit.shape.lids import FIRST, PHOTOS, open_lids
 from relit.geometry.hull import NoShape, distance_of, visual_hull
 from relit.recipe import FitContext
 from relit.rendering.appearance.light_per_photo import shade_photos, start_photo_lights
-from relit.run import run_arrays
 from relit.scene import Camera
 
 DIFFUSION = 0.1  # of the volume pass: with quiet masks it needs less smoothing
@@ -53,88 +55,123 @@ def fresh_model(values: np.ndarray, tints: np.ndarray) -> VolumeModel:
     return model
 
 
-def volume_stage(shots, cameras, weights, linked, tints, fit: FitContext):
-    """(pixel bank with the final cameras, cameras, model). Poses that come from matches move at a
-    third of the others' rate."""
-    run, options, seed = fit.run, fit.options, fit.seed
+@dataclass
+class FittedShape:
+    """Where the shape of a collection is while its cameras still move. bank: pixels, with the
+    present cameras and no corrections. cameras: of the photos, unit frame."""
+
+    bank: PixelBank
+    cameras: list[Camera]
+    model: VolumeModel
+
+    def place(self, cameras: list[Camera]) -> None:
+        """Take these cameras."""
+        self.cameras = cameras
+        place_cameras(self.bank, cameras)
+
+    def free_cameras(self) -> None:
+        """Let the next volume pass move cameras and focal lengths."""
+        self.bank.corrections = no_corrections(self.bank.views, CorrectionModel.ABOUT_ORIGIN)
+
+    def take(self, result: VolumeResult) -> None:
+        """Take the field and the cameras that a volume pass ends with."""
+        restore_model(self.model, self.bank, result)
+        self.place(corrected(self.cameras, self.bank.corrections))
+
+
+def start_of_shape(photos: PhotoSet, poses: PhotoPoses, fit: FitContext) -> FittedShape:
+    """The hull of the silhouettes. Cameras that come from matches move at a third of the others'
+    rate."""
+    options, shots, cameras = fit.options, photos.shots, poses.cameras(photos.shots)
     silhouettes = [s.mask for s in shots]
-    bank = weighted_bank(make_bank(cameras, [s.rgb for s in shots], silhouettes), weights, seed)
-    bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
-    o = volume_options(options)
-    values = tolerant_hull(cameras, silhouettes, o.levels[0])
-    limit = (
-        depth_limit(
-            collection_crops(shots), np.array([c.world_from_camera for c in cameras]), o.levels[0]
-        )
-        if len(shots) < FEW
-        else None
+    bank = make_bank(cameras, [s.rgb for s in shots], silhouettes)
+    weights = np.ones(len(shots)) if "posterior" in options.without else poses.weights()
+    bank = weighted_bank(bank, weights, fit.seed)
+    nodes = volume_options(options).levels[0]
+    values = tolerant_hull(cameras, silhouettes, nodes)
+    if len(shots) < FEW:
+        placed = np.array([c.world_from_camera for c in cameras])
+        limit = depth_limit(collection_crops(shots), placed, nodes)
+        if limit is not None and (limit & (values < 0)).any():
+            values = distance_of(limit & (values < 0))
+    model = fresh_model(values, photos.tints)
+    each = CorrectionModel.ABOUT_ORIGIN.value
+    model.correction_ratios = mi.Float(
+        np.repeat(np.where(poses.linked, 0.3, 1.0), each).astype(np.float32)
     )
-    if limit is not None and (limit & (values < 0)).any():
-        values = distance_of(limit & (values < 0))
-    model = fresh_model(values, tints)
-    model.correction_ratios = mi.Float(np.repeat(np.where(linked, 0.3, 1.0), 7).astype(np.float32))
-    if run.done("volume"):
-        restore_model(model, bank, run_arrays(run, "volume", "checkpoint"))
-    else:
-        with run.stage(
-            "volume", steps=sum(o.steps), title="shape and cameras (volume pass)"
-        ) as stage:
-            fit_volume(bank, model, o, stage, seed)
-    cameras = corrected(cameras, bank.corrections)
-    place_cameras(bank, cameras)
-    return bank, cameras, model
+    return FittedShape(bank, cameras, model)
 
 
-def opened_stage(
-    bank: PixelBank, shots, cameras: list[Camera], model: VolumeModel, tints, fit: FitContext
-):
-    """The cameras after the finer levels of the volume pass, made again where a hollow was found
-    that no silhouette shows; `model` is then the opened one, and `bank` gets the cameras. As they
-    are where there is none."""
-    run, options, seed = fit.run, fit.options, fit.seed
-    if options.hollows == 0 or len(shots) < PHOTOS:
-        return cameras
-    bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
-    if run.done("hollows"):
-        found = run_arrays(run, "hollows", "hollows")["distances"]
-    else:
-        with run.stage("hollows", title="hollows that no silhouette shows") as stage:
-            hull, show = (
-                tolerant_hull(cameras, [s.mask for s in shots], FIRST.nodes),
-                run.progress("hollows that no silhouette shows"),
-            )
-            gone = open_lids(
-                bank,
-                cameras,
-                hull,
-                lambda v: fresh_model(v, tints),
-                run.say,
-                seed,
-                options.hollows,
-                progress=show,
-            )
-            found = np.zeros((0, 0, 0), np.float32) if gone is None else gone
-            stage.save("hollows", distances=found)
-    if not found.size:
-        return cameras
-    if run.done("opened"):
-        restore_model(model, bank, run_arrays(run, "opened", "checkpoint"))
-    else:
-        o = volume_options(options)
-        finer = replace(
-            o,
-            levels=o.levels[1:] or o.levels,
-            steps=o.steps[1:] or o.steps,
-            mask=o.mask[1:] or o.mask,
+def volume_stage(photos: PhotoSet, poses: PhotoPoses, fit: FitContext) -> FittedShape:
+    """The volume pass with cameras and focal lengths free, and a small light for each photo."""
+    shape, o = start_of_shape(photos, poses, fit), volume_options(fit.options)
+    shape.free_cameras()
+
+    def computed(stage) -> VolumeResult:
+        fit_volume(shape.bank, shape.model, o, stage, fit.seed)
+        return volume_result(shape.model, shape.bank)
+
+    title = "shape and cameras (volume pass)"
+    shape.take(fit.run.cached("volume", VolumeResult, computed, steps=sum(o.steps), title=title))
+    return shape
+
+
+@dataclass(frozen=True)
+class HollowDistances:
+    """distances: (n, n, n) float32 to the space that was found under flat faces of the hull, or
+    None where there is none."""
+
+    distances: np.ndarray | None
+
+
+def hollows_stage(shape: FittedShape, photos: PhotoSet, fit: FitContext) -> HollowDistances:
+    """Spaces that no silhouette shows, tested by the photos."""
+    run, options = fit.run, fit.options
+
+    def computed(stage) -> HollowDistances:
+        hull = tolerant_hull(shape.cameras, [s.mask for s in photos.shots], FIRST.nodes)
+        gone = open_lids(
+            shape.bank,
+            shape.cameras,
+            hull,
+            lambda v: fresh_model(v, photos.tints),
+            run.say,
+            fit.seed,
+            options.hollows,
+            progress=run.progress("hollows that no silhouette shows"),
         )
-        with run.stage(
-            "opened", steps=sum(finer.steps), title="shape and cameras, opened (volume pass)"
-        ) as stage:
-            next_level(model, finer.levels[0], BAND, lambda values: without(values, found))
-            fit_volume(bank, model, finer, stage, seed + 1)
-    cameras = corrected(cameras, bank.corrections)
-    place_cameras(bank, cameras)
-    return cameras
+        return HollowDistances(gone)
+
+    title = "hollows that no silhouette shows"
+    return run.cached("hollows", HollowDistances, computed, title=title)
+
+
+def opened_stage(shape: FittedShape, photos: PhotoSet, fit: FitContext) -> None:
+    """Run the finer levels of the volume pass again where a hollow was found; `shape` is then the
+    opened one."""
+    options = fit.options
+    if options.hollows == 0 or len(photos.shots) < PHOTOS:
+        return
+    shape.free_cameras()
+    found = hollows_stage(shape, photos, fit).distances
+    if found is None:
+        return
+    o = volume_options(options)
+    finer = replace(
+        o,
+        levels=o.levels[1:] or o.levels,
+        steps=o.steps[1:] or o.steps,
+        mask=o.mask[1:] or o.mask,
+    )
+
+    def computed(stage) -> VolumeResult:
+        next_level(shape.model, finer.levels[0], BAND, lambda values: without(values, found))
+        fit_volume(shape.bank, shape.model, finer, stage, fit.seed + 1)
+        return volume_result(shape.model, shape.bank)
+
+    title = "shape and cameras, opened (volume pass)"
+    steps = sum(finer.steps)
+    shape.take(fit.run.cached("opened", VolumeResult, computed, steps=steps, title=title))
 
 
 def tolerant_hull(cameras: list[Camera], masks: list[np.ndarray], nodes: int) -> np.ndarray:

@@ -19,6 +19,7 @@ from relit.fit.collection.options import CollectionOptions
 from relit.fit.passes.broad_steps import BroadSteps
 from relit.fit.passes.losses import display_weight, dual_values, weighted_mean
 from relit.fit.passes.material_priors import (
+    ALBEDO_START,
     SurfaceOptions,
     common_scale,
     material_prior,
@@ -28,6 +29,7 @@ from relit.fit.passes.optimiser import Adam, Variable, cosine_decay
 from relit.fit.passes.pixels import PixelBank, saturated_at
 from relit.fit.passes.surface import MaterialSchedule
 from relit.fit.passes.surface_loop import drawn_points, neighbour_points, run_surface
+from relit.geometry.mesh import vertex_areas
 from relit.lighting.neural_pil import load_neural_pil
 from relit.lighting.per_photo import (
     TEXELS,
@@ -45,11 +47,41 @@ from relit.rendering.transport import (
     reflected,
     sample_lights,
 )
+from relit.scene import Mesh
 
 LEAST = (
     0.02  # weight of a silenced photo: the material hardly hears it, its own light still follows
 )
 HISTORY = 1000  # losses in the ring buffer of posterior scaling
+
+
+@dataclass(frozen=True)
+class AlbedoMesh:
+    """mesh: in the unit frame, with an atlas. albedo: (V, 3) colour of its vertices without light,
+    linear, up to scale."""
+
+    mesh: Mesh
+    albedo: np.ndarray
+
+    @property
+    def scale(self) -> float:
+        """Factor that gives the colours a mean of ALBEDO_START over the surface."""
+        areas = vertex_areas(self.mesh)
+        return ALBEDO_START / float((self.albedo * areas[:, None]).sum() / areas.sum() / 3)
+
+
+@dataclass(frozen=True)
+class PhotoLitMaterial:
+    """Textures (S, S[, 3]) of a metallic-roughness material, linear: base_color, roughness,
+    metallic, normal (tangent space). lights: (P, ROWS, COLUMNS, 3) radiance of each photo's
+    environment, lat-long in the unit frame. weights: (P,) of the photos in the fit."""
+
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    normal: np.ndarray
+    lights: np.ndarray
+    weights: np.ndarray
 
 
 @dataclass(frozen=True)
