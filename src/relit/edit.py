@@ -56,7 +56,7 @@ def edit(
     """
     out, asset = Path(out), load_asset(run)
     _in_range({"roughness": roughness, "metallic": metallic})
-    known = {i.label for i in asset.instances if i.registered}
+    known = {i.label for i in asset.instances if i.registered and i.photo == 0}
     for label in remove:
         if label not in known:
             raise UserError(
@@ -80,7 +80,7 @@ def edit(
             material = replace(material, **{name: np.full_like(getattr(material, name), value)})
     if before.diffuse is not None:
         material = as_plastic(material, before, tint, base_color is not None, roughness is not None)
-    kept = tuple(i for i in asset.instances if i.label not in remove)
+    kept = tuple(i for i in asset.instances if i.photo or i.label not in remove)
     if asset.instances and not any(i.registered for i in kept):
         raise UserError("nothing would be left", fix="keep at least one instance", code=EXIT_USAGE)
     changed = replace(asset, material=material, instances=kept)
@@ -90,7 +90,9 @@ def edit(
         ids, new_ids = _ids(asset, camera), _ids(changed, camera)
         same = material is asset.material
         shown, told = (
-            np.array([i.label for i in asset.instances if i.registered] + [0])[ids],
+            np.array([i.label for i in asset.instances if i.registered and i.photo == 0] + [0])[
+                ids
+            ],
             _labels_beside(photo, ids.shape),
         )
         if told is not None and name != asset.cameras[0][0]:
@@ -200,7 +202,7 @@ def insert(
             code=EXIT_USAGE,
         )
     placed = mesh_on_ground(mesh, asset, camera, at, size, turn)
-    poses = [i.world_from_object for i in asset.instances if i.registered]
+    poses = [i.world_from_object for i in asset.instances if i.registered and i.photo == 0]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)  # pyright: ignore[reportArgumentType]
     before = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
     whole, materials = joined(pile.mesh, pile.material, placed, material)
@@ -275,7 +277,7 @@ def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.nd
 
 def _ids(asset: Asset, camera: Camera) -> np.ndarray:
     """(H, W) which registered instance each pixel shows, -1 for none."""
-    poses = [i.world_from_object for i in asset.instances if i.registered] or [
+    poses = [i.world_from_object for i in asset.instances if i.registered and i.photo == 0] or [
         asset.world_from_asset
     ]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)  # pyright: ignore[reportArgumentType]

@@ -237,12 +237,14 @@ class Instance:
 
     label: its number in the label image. world_from_object: (4, 4) similarity from the asset frame,
     None where it was not registered.
-    reason: why not; of one that was, what is uncertain about its pose.
+    reason: why not; of one that was, what is uncertain about its pose. photo: number of the photo,
+    from 0, that the label is of.
     """
 
     label: int
     world_from_object: np.ndarray | None
     reason: str = ""
+    photo: int = 0
 
     @property
     def registered(self) -> bool:

@@ -6,7 +6,8 @@ with one node for each of them.
      "ground": {"point": [x, y, z], "normal": [x, y, z], "radius": r, "colour": [r, g, b],
      "roughness": .8}}
 
-A registered instance has a reason where its pose is uncertain. The object frame is the asset frame
+An instance that the first photo does not show has the number of the photo whose label it is,
+`"photo": 2`. A registered instance has a reason where its pose is uncertain. The object frame is the asset frame
 (the GLB's coordinates after its node transforms), the world that of `cameras.json`.
 """
 
@@ -29,6 +30,8 @@ def write_instances(folder: Path, asset: Asset) -> None:
     listed = []
     for i in asset.instances:
         entry: dict = {"label": int(i.label), "registered": i.registered}
+        if i.photo:
+            entry["photo"] = int(i.photo) + 1
         if i.registered:
             entry["world_from_object"] = np.asarray(i.world_from_object, np.float64).tolist()
         if i.reason or not i.registered:
@@ -45,7 +48,7 @@ def write_instances(folder: Path, asset: Asset) -> None:
             "roughness": float(g.roughness),
         }
     (folder / "instances.json").write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
-    poses = [(f"instance_{i.label}", i.world_from_object) for i in asset.instances if i.registered]
+    poses = [(node_name(i), i.world_from_object) for i in asset.instances if i.registered]
     asset_from_world = np.linalg.inv(asset.world_from_asset)  # +Y stays up
     write_glb(
         folder / "scene.glb",
@@ -53,6 +56,12 @@ def write_instances(folder: Path, asset: Asset) -> None:
         asset.material,
         instances=[(name, asset_from_world @ np.asarray(pose)) for name, pose in poses],
     )
+
+
+def node_name(instance: Instance) -> str:
+    """The name of an instance's node in scene.glb."""
+    photo = f"photo_{instance.photo + 1}_" if instance.photo else ""
+    return f"{photo}instance_{instance.label}"
 
 
 def read_instances(folder: Path) -> tuple[tuple[Instance, ...], Ground | None]:
@@ -76,7 +85,10 @@ def read_instances(folder: Path) -> tuple[tuple[Instance, ...], Ground | None]:
                     or abs(np.linalg.det(pose)) < 1e-30
                 ):
                     raise ValueError("a pose is no regular 4 x 4 matrix")
-            instances.append(Instance(int(entry["label"]), pose, str(entry.get("reason", ""))))
+            photo = int(entry.get("photo", 1)) - 1
+            instances.append(
+                Instance(int(entry["label"]), pose, str(entry.get("reason", "")), photo)
+            )
         ground = None
         if data.get("ground"):
             g = data["ground"]

@@ -154,7 +154,11 @@ def evaluate_duplicates(
 
 def registered_poses(asset: Asset) -> dict[int, np.ndarray]:
     """label -> world_from_object (4, 4) of the registered instances."""
-    return {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
+    return {
+        i.label: np.asarray(i.world_from_object)
+        for i in asset.instances
+        if i.registered and i.photo == 0
+    }
 
 
 def _pose_and_shape_figures(
@@ -256,7 +260,11 @@ def evaluate_on_photo(
     asset, capture = load_asset(run), Path(capture)
     values = {"photo_psnr": photo_figure(asset, capture, run=Path(run), spp=spp, seed=seed)}
     reference = reference_poses(capture, asset.cameras[0][1])
-    poses = {i.label: np.asarray(i.world_from_object) for i in asset.instances if i.registered}
+    poses = {
+        i.label: np.asarray(i.world_from_object)
+        for i in asset.instances
+        if i.registered and i.photo == 0
+    }
     if reference:
         values.update(instance_pose_figures(poses, reference, dict.fromkeys(reference, 1.0)))
         before = poses_before(Path(run), asset.cameras[0][1], list(poses))
@@ -328,7 +336,9 @@ def photo_figure(
             fix=f"give the folder that the run was made from: {capture}",
         )
     camera = asset.cameras[0][1]
-    own = np.isin(pixels.labels, [i.label for i in asset.instances if i.registered])
+    own = np.isin(
+        pixels.labels, [i.label for i in asset.instances if i.registered and i.photo == 0]
+    )
     camera = camera.within(PHOTO_SIDE)
     rgb, where = (
         shrunk_to_camera(pixels.rgb, camera),
@@ -400,9 +410,13 @@ def poses_before(run: Path, photo: Camera, labels: list[int]) -> dict[int, np.nd
     from relit.files import NO_ARRAYS, load_arrays
 
     try:
-        saved = load_arrays(run / "stages" / "poses" / "poses.npz")
-        found = {int(k): p for k, p in zip(saved["labels"], saved["poses"], strict=True)}
-    except NO_ARRAYS:  # not there, or damaged
+        saved = load_arrays(run / "stages" / "poses" / "result.npz")
+        found = {
+            int(saved[f"ids.{k}.label"]): pose
+            for k, pose in enumerate(saved["poses"])
+            if not saved[f"ids.{k}.photo"]
+        }
+    except (*NO_ARRAYS, KeyError):  # not there, or damaged
         return {}
     return {k: photo.world_from_camera @ np.linalg.inv(found[k]) for k in labels if k in found}
 

@@ -27,21 +27,51 @@ from relit.rendering.blocks import block_sums, repeat
 from relit.scene import Mesh
 
 OFFSET = 1e-3  # of the unit frame, along the normal
-NO_TEXELS = -0.5  # texture coordinates below are those of faces without texels
+
+
+@dataclass(frozen=True)
+class Blockers:
+    """A mesh without texels, which only blocks light and reflects its own, and the linear radiance
+    (V, 3) of its vertices."""
+
+    mesh: Mesh
+    radiance: np.ndarray
 
 
 class TraceableMesh:
     """A mesh with uvs, normals and one RGB radiance per vertex, in the unit frame, ready for ray
-    queries. Faces whose uvs are below NO_TEXELS carry none: they only block (the ground of a photo
-    of duplicates)."""
+    queries, and what else is in the scene.
 
-    def __init__(self, mesh: Mesh, radiance: np.ndarray):
+    mesh, radiance: of the textured mesh, followed by the blockers. textured_faces,
+    textured_vertices: how many of the faces and vertices are not blockers.
+    """
+
+    def __init__(self, mesh: Mesh, radiance: np.ndarray, blockers: Blockers | None = None):
+        self.textured_faces, self.textured_vertices = len(mesh.faces), len(mesh.vertices)
+        if blockers is not None:
+            mesh = joined(mesh, blockers.mesh)
+            radiance = np.concatenate([radiance, blockers.radiance])
         self.mesh, self.scene = mesh, build_geometry(mesh)
         self.origins = SmoothOrigins(mesh)
         self.faces, self.normals = self.origins.faces, self.origins.normals
         self.uvs = mi.Float(np.ascontiguousarray(mesh.uvs, np.float32).ravel())
         self.tangents = mi.Float(vertex_tangents(mesh).ravel())
         self.radiance = mi.Float(np.ascontiguousarray(radiance, np.float32).ravel())
+
+    @property
+    def only_blocks(self) -> np.ndarray:
+        """(V,) bool: vertices of the blockers."""
+        return np.arange(len(self.mesh.vertices)) >= self.textured_vertices
+
+
+def joined(one: Mesh, other: Mesh) -> Mesh:
+    """Both meshes, with normals and uvs, as one."""
+    return Mesh(
+        np.concatenate([one.vertices, other.vertices]),
+        np.concatenate([one.faces, other.faces + len(one.vertices)]),
+        np.concatenate([one.normals, other.normals]),
+        np.concatenate([one.uvs, other.uvs]),
+    )
 
 
 @dataclass
@@ -88,7 +118,7 @@ def first_hits(mesh: TraceableMesh, o, d) -> Points:
         along = dr.select(hit & (length > 1e-6), along / dr.maximum(length, 1e-6), mi.Frame3f(n).s)
         across = dr.select(t.w < 0, -1.0, 1.0) * dr.cross(n, along)
         geometric = dr.select(hit, mi.Vector3f(si.n), mi.Vector3f(0, 0, 1))
-        seen = hit & (dr.dot(si.n, d) < 0) & (uv.x > NO_TEXELS)
+        seen = hit & (dr.dot(si.n, d) < 0) & (pi.prim_index < mesh.textured_faces)
         return Points(seen, x, n, geometric, -mi.Vector3f(d), uv, along, across)
 
 

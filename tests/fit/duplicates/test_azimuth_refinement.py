@@ -10,9 +10,11 @@ from relit.conventions import similarity
 from relit.fit.duplicates import azimuth_refinement as module
 from relit.fit.duplicates import recipe as duplicates
 from relit.fit.duplicates.azimuth_refinement import turned_as_shown
+from relit.fit.duplicates.placed_pile import PlacedPile
 from relit.fit.registration.instances.azimuth import turned_by
-from relit.fit.registration.instances.views import InstanceView
+from relit.fit.registration.instances.views import InstanceView, ViewId
 from relit.geometry.se3 import look_at, rotation_angle
+from relit.recipe import FitContext
 from relit.reference.photographed import as_photographed
 from relit.run import Run
 from relit.scene import Asset, Camera, Instance, Material
@@ -66,7 +68,7 @@ def photographed():
 def test_the_turn_that_looks_like_the_photo_is_found(photographed, angle):
     asset, camera, view, pose = photographed
     guess = turned_by(pose, AXIS, angle)
-    begun = module.with_instances_moved(asset, {7: np.linalg.inv(guess) @ pose})
+    begun = module.with_instances_moved(asset, {ViewId(0, 7): np.linalg.inv(guess) @ pose})
     seen = []
     found = turned_as_shown(begun, [view], [camera], guess[None], AXIS, progress=seen.append)
     assert rotation_angle(found[0][:3, :3] @ pose[:3, :3].T) < 3.0
@@ -82,22 +84,29 @@ def test_only_guessed_instances_are_turned_and_a_rerun_reads_them_back(
 ):
     asset, camera, view, pose = photographed
     guess = turned_by(pose, AXIS, 2.5)
-    begun = module.with_instances_moved(asset, {7: np.linalg.inv(guess) @ pose})
+    begun = module.with_instances_moved(asset, {ViewId(0, 7): np.linalg.inv(guess) @ pose})
     other = np.linalg.inv(asset.instances[0].world_from_object)
-    parts = {
-        "poses": np.array([other, guess]) @ camera.world_from_camera,
-        "keys": np.array([3, 7]),
-        "vague": np.array([7]),
-        "motions": np.eye(4)[None],
-    }
+    names = (ViewId(0, 3), ViewId(0, 7))
+    pile = PlacedPile(
+        mesh=asset.mesh,
+        radiance=np.zeros((2, 1, 3)),
+        poses=np.array([other, guess]) @ camera.world_from_camera,
+        ids=names,
+        views=names,
+        view_instances=np.arange(2),
+        motions=np.eye(4)[None],
+        related=np.ones(1, bool),
+        guessed=names[1:],
+    )
     views = [replace(view, label=3), view]
     with Run.open(tmp_path / "run", {}) as run:
-        poses = duplicates.turns_stage(begun, asset.mesh, views, camera, parts, run, 0)
-        assert np.array_equal(poses[0], parts["poses"][0])
+        poses = duplicates.turns_stage(begun, pile, views, camera, FitContext(run, None, 0)).poses
+        assert np.array_equal(poses[0], pile.poses[0])
         assert rotation_angle(poses[1][:3, :3] @ (pose @ camera.world_from_camera)[:3, :3].T) < 3.0
         monkeypatch.setattr(duplicates, "turned_as_shown", None)
         assert np.array_equal(
-            duplicates.turns_stage(begun, asset.mesh, views, camera, parts, run, 0), poses
+            duplicates.turns_stage(begun, pile, views, camera, FitContext(run, None, 0)).poses,
+            poses,
         )
 
 

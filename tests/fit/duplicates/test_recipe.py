@@ -20,12 +20,18 @@ from relit.evaluate.dispatch import evaluate
 from relit.fit.duplicates import pose_passes, recipe, shape
 from relit.fit.duplicates import poses as poses_stage
 from relit.fit.duplicates import recover_unregistered as found_again
+from relit.fit.duplicates.mirrored_silhouettes import Symmetry
 from relit.fit.registration.instances import outliers as odd
+from relit.fit.registration.instances.views import ViewId
+from relit.fit.registration.placements import all_placed
 from relit.geometry.sdf import node_positions
 from relit.geometry.se3 import exp_so3, rotation_angle
+from relit.geometry.symmetry import Plane
 from relit.images import write_linear
 from relit.recipe import FitContext
+from relit.records import from_arrays, to_arrays
 from relit.run import Run
+from relit.scene import Mesh
 from relit.synthesize.duplicates import RADIUS, heap, synthesize_duplicates
 from relit.synthesize.procedural import pawn
 from support.pile_of_pawns import SIZES, small_options, true_poses
@@ -44,7 +50,9 @@ def stand_in(monkeypatch, poses, unsure=0.0):
     """Let the search of the poses return these, the first of them being ambiguous by `unsure`
     degrees."""
     monkeypatch.setattr(
-        poses_stage, "place_few", lambda views, search, **_: (poses, np.full(len(views), 0.95))
+        poses_stage,
+        "place_few",
+        lambda views, search, **_: all_placed(poses, np.full(len(views), 0.95)),
     )
     monkeypatch.setattr(
         poses_stage,
@@ -324,25 +332,30 @@ def told_passes(monkeypatch, asked: list, *told: dict):
     Pass), and say that b is odd."""
     asked.clear()
 
-    def stage(views, poses, number, run, options, seed, last, seek, final):
-        names = [v.key for v in views]
+    def stage(views, poses, task, fit):
+        names, number, last = [v.id for v in views], task.number, task.last
         asked.append(
-            "".join(names) + ("?" + "".join(v.key for v in seek()) if seek else "") + "." * final
+            "".join(names)
+            + ("?" + "".join(v.id for v in task.seek()) if task.seek else "")
+            + "." * task.final
         )
         assert (last and last.symmetry) == (number or None)  # the pass before
         odd = np.array([name == "b" for name in names])
         fields = {"errors": np.ones(len(names)), "turn": 2.0, "off": 3.0, **told[number]}
+        if "found" in fields:
+            found = fields.pop("found")
+            fields |= {"joining": tuple(found), "joining_poses": np.array([*found.values()])}
         return pose_passes.Pass(
             poses + np.where(odd, 0, 1)[:, None, None], odd, symmetry=number + 1, **fields
         )
 
     monkeypatch.setattr(pose_passes, "joint_stage", stage)
-    some = [SimpleNamespace(key=name) for name in "abcde"]
+    some = [SimpleNamespace(id=name) for name in "abcde"]
     say = SimpleNamespace(say=lambda text: asked.append(text))
     views, *rest = pose_passes.joint_stages(
         some[:3], np.zeros((3, 4, 4)), some[3:], lambda left: left, FitContext(say, None, 0)
     )
-    return "".join(v.key for v in views), *rest
+    return "".join(v.id for v in views), *rest
 
 
 def test_passes_for_the_poses_are_made_until_they_have_arrived(monkeypatch):
@@ -422,62 +435,38 @@ def test_who_is_found_in_the_last_pass_takes_part_in_more(monkeypatch):
 
 
 def test_a_pass_is_kept_whole():
+    mesh = Mesh(*(np.ones((3, 3), t) for t in (np.float32, np.int32, np.float32)))
     one = pose_passes.Pass(
         np.ones((2, 4, 4)),
         np.array([True, False]),
         np.array([0.1, 0.2]),
         1.5,
         None,
-        None,
+        Symmetry(Plane(np.array([1.0, 0, 0]), 0.2), mesh),
         True,
         True,
-        {7: np.eye(4)},
+        (ViewId(1, 7),),
+        np.eye(4)[None],
+        np.zeros((2, 2, 2)),
     )
-    again = pose_passes.pass_from(one.arrays)
-    assert (
-        again.off is None
-        and again.symmetry is None
-        and again.mixed
-        and again.one_sided
-        and again.turn == 1.5
-    )
-    assert (
-        np.array_equal(again.errors, one.errors)
-        and np.array_equal(again.odd, one.odd)
-        and list(again.found) == [7]
-    )
-    assert (
-        np.array_equal(again.found[7], np.eye(4))
-        and not pose_passes.pass_from(replace(one, found={}).arrays).found
-    )
-    old = pose_passes.pass_from(
-        {
-            k: v
-            for k, v in one.arrays.items()
-            if k not in ("errors", "found", "there", "mixed", "one_sided")
-        }
-    )
-    assert (
-        not old.found
-        and not old.mixed
-        and not old.one_sided
-        and np.isnan(old.errors).all()
-        and len(old.errors) == 2
-    )
+    again = from_arrays(pose_passes.Pass, to_arrays(one))
+    assert again.off is None and again.mixed and again.one_sided and again.turn == 1.5
+    assert again.symmetry.plane.offset == 0.2 and np.array_equal(again.errors, one.errors)
+    assert np.array_equal(again.found[ViewId(1, 7)], np.eye(4)) and len(again.found) == 1
 
 
 def test_who_joins_is_sought_where_few_are_left_out(monkeypatch):
     asked, said = [], []
 
     def sought(view, *, guess):
-        asked.append(view.key)
-        return {1: (np.eye(4), True), 2: (np.eye(4), False), 3: (None, False)}[view.key]
+        asked.append(view.id)
+        return {1: (np.eye(4), True), 2: (np.eye(4), False), 3: (None, False)}[view.id]
 
     def joined(count, *keys, axis=None, without=()):
         asked.clear()
         monkeypatch.setattr(found_again, "seeker", lambda *_: sought)
         monkeypatch.setattr(found_again, "body_axis", lambda mesh: axis)
-        others = [SimpleNamespace(key=k, label=k, photo=0) for k in keys]
+        others = [SimpleNamespace(id=k, label=k, photo=0) for k in keys]
         poses = np.tile(np.eye(4), (count, 1, 1))
         poses[:, 0, 3] = np.arange(count)
         after = poses + np.eye(4)[3] * np.array([[2.0], [0], [0], [0]])

@@ -130,8 +130,10 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
     import drjit as dr
     import mitsuba as mi
 
-    from relit.fit.duplicates.scene import alone_bank, scene_mesh, spread_moves
+    from relit.fit.duplicates.placed_pile import PlacedPile
+    from relit.fit.duplicates.scene import alone_bank, instance_meshes, pile_scene, spread_moves
     from relit.fit.passes.pixels import batch_of
+    from relit.fit.registration.instances.views import ViewId
     from relit.lighting.environment import Environment
     from relit.materials.brdf import Surface
     from relit.rendering.transport import TraceableMesh, first_hits, sample_lights
@@ -152,15 +154,23 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
         labels[np.hypot(column + 0.5 - x, row + 0.5 - y) < 150 * 0.7 / z] = 10 + k
     labels[0, 0] = 99  # an object that is not registered
     pixels = Pixels(np.random.default_rng(0).random((64, 96, 3)).astype(np.float32), labels=labels)
-    parts = {
-        "radiance": np.ones((6, len(mesh.vertices), 3), np.float32),
-        "plane": np.stack([[0, 0.7, 8.0], [0, -1.0, 0]]),
-    }
+    names = tuple(ViewId(0, 10 + k) for k in range(6))
+    pile = PlacedPile(
+        mesh=mesh,
+        radiance=np.ones((6, len(mesh.vertices), 3), np.float32),
+        poses=np.linalg.inv(standing),
+        ids=names,
+        views=names,
+        view_instances=np.arange(6),
+        motions=np.eye(4)[None],
+        related=np.ones(1, bool),
+        plane=np.stack([[0, 0.7, 8.0], [0, -1.0, 0]]),
+    )
     place = similarity(np.eye(3), np.array([0, 0, -8.7]))
     moves = spread_moves(standing, place)
     own = camera.with_pose(place)
-    whole, radiance = scene_mesh(mesh, parts, standing, place, pixels, camera, moves)
-    assert whole.vertices.shape == (6 * len(mesh.vertices), 3) and (whole.uvs >= 0).all()
+    whole, radiance = instance_meshes(pile, place, moves)
+    assert whole.vertices.shape == (6 * len(mesh.vertices), 3)
     bank = alone_bank([pixels], [own], [{10 + k: k for k in range(6)}], moves, 10**6)
     batch = batch_of(bank, bank.candidates)
     traced = TraceableMesh(whole, radiance)
@@ -186,8 +196,8 @@ def test_without_visibility_nothing_but_itself_shadows_an_instance(device):
         return np.average(np.array(drawn.visible), weights=np.array(drawn.weight) > 0)
 
     assert open_sky(traced, points) > 0.995
-    together, radiance = scene_mesh(mesh, parts, standing, place, pixels, camera)
-    scene = TraceableMesh(together, radiance)
+    scene = pile_scene(pile, place, pixels, camera).traceable()
+    assert scene.only_blocks.sum() == len(scene.mesh.vertices) - 6 * len(mesh.vertices) > 0
     points.x = mi.Point3f(
         points.x - dr.gather(mi.Vector3f, mi.Float(moves.ravel().astype(np.float32)), batch.view)
     )

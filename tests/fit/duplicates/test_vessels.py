@@ -196,10 +196,9 @@ def asked(folder, profile, monkeypatch):
     views, poses = all_views(shots, 160, options), true_poses(photo)
     monkeypatch.setattr(shape, "built_again", lambda *_: coned(scale))
     with Run.open(folder / "run", {}) as run:
-        with run.stage("joint", title="joint") as stage:
-            stage.save("checkpoint", values=coned(scale))
-        found = shape.vessel_stage(shots, views, poses, None, FitContext(run, options, 0))
-        again = shape.vessel_stage(shots, views, poses, None, FitContext(run, options, 0))
+        last = SimpleNamespace(values=coned(scale), symmetry=None)
+        found = shape.vessel_stage(shots, views, poses, last, FitContext(run, options, 0))
+        again = shape.vessel_stage(shots, views, poses, last, FitContext(run, options, 0))
     assert np.array_equal(found, again)
     return found, scale, (folder / "run" / "log.txt").read_text()
 

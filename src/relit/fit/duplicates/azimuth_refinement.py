@@ -22,7 +22,7 @@ import numpy as np
 
 from relit.conventions import srgb_from_linear
 from relit.fit.registration.instances.azimuth import turned_by
-from relit.fit.registration.instances.views import InstanceView
+from relit.fit.registration.instances.views import InstanceView, ViewId
 from relit.fit.shape.picture_alignment import align_picture, moved_by
 from relit.geometry.revolution_axis import Axis
 from relit.reference.mitsuba_scene import Scene, render
@@ -71,7 +71,7 @@ def turned_as_shown(
     def differences(angles: np.ndarray) -> np.ndarray:
         nonlocal count
         turned = [turned_by(p, axis, a) for p, a in zip(poses, angles, strict=True)]
-        moves = {v.key: np.linalg.inv(t) @ p for v, t, p in zip(views, turned, poses, strict=True)}
+        moves = {v.id: np.linalg.inv(t) @ p for v, t, p in zip(views, turned, poses, strict=True)}
         scene = lit_scene(with_instances_moved(asset, moves))
         count += 1
         progress(count)
@@ -158,12 +158,11 @@ def difference(
     return float((one * other).mean())
 
 
-def with_instances_moved(asset: Asset, moves: dict[int, np.ndarray]) -> Asset:
-    """The asset with some instances, by label, moved by (4, 4) in the world."""
-    stand = [
-        i
-        if i.label not in moves
-        else replace(i, world_from_object=moves[i.label] @ i.world_from_object)
-        for i in asset.instances
-    ]
+def with_instances_moved(asset: Asset, moves: dict[ViewId, np.ndarray]) -> Asset:
+    """The asset with some instances moved by (4, 4) in the world."""
+    stand = []
+    for i in asset.instances:
+        move = moves.get(ViewId(i.photo, i.label))
+        pose = i.world_from_object if move is None else move @ i.world_from_object
+        stand.append(replace(i, world_from_object=pose))
     return replace(asset, instances=tuple(stand))

@@ -53,27 +53,6 @@ class Symmetry:
     plane: Plane
     mesh: Mesh
 
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What a stage keeps of it, see `symmetry_from`."""
-        plane = np.array([*self.plane.normal, self.plane.offset])
-        return {
-            "mirror": plane,
-            "vertices": self.mesh.vertices,
-            "faces": self.mesh.faces,
-            "normals": self.mesh.normals,
-        }
-
-
-def symmetry_from(saved: dict[str, np.ndarray]) -> Symmetry | None:
-    """The symmetry among the arrays of a stage; None where it has kept none."""
-    if "mirror" not in saved:
-        return None
-    return Symmetry(
-        Plane(saved["mirror"][:3], float(saved["mirror"][3])),
-        Mesh(saved["vertices"], saved["faces"], saved["normals"]),
-    )
-
 
 @dataclass(frozen=True)
 class MirroredRays:

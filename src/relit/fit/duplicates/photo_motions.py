@@ -36,6 +36,11 @@ class SharedScene:
     of_view: np.ndarray
 
 
+def motion_or_none(motion: np.ndarray | None) -> np.ndarray:
+    """The motion, or none at all where it is not known."""
+    return np.eye(4) if motion is None else motion
+
+
 def gather(standing: np.ndarray, photo: np.ndarray) -> SharedScene:
     """The scene of views at photo_from_object `standing` (N, 4, 4), from photos number `photo`
     (N,). The first photo's frame is the scene's."""

@@ -18,18 +18,19 @@ from relit.fit.duplicates.mirrored_silhouettes import (
     find_symmetry,
     mirrored_rays,
     mirrored_views,
-    symmetry_from,
 )
 from relit.fit.duplicates.options import DuplicatesOptions
-from relit.fit.duplicates.photo_motions import SharedScene, gather
+from relit.fit.duplicates.photo_motions import SharedScene, gather, motion_or_none
 from relit.fit.duplicates.poses import instance_name
 from relit.fit.duplicates.vessels import body_axis
+from relit.fit.passes.pixels import PixelBank
 from relit.fit.passes.volume import VolumeModel, VolumeOptions, fit_volume, start_model
 from relit.fit.registration.instances.near_symmetry_search import coherent_turns
 from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.outliers import odd_instances, view_errors
 from relit.fit.registration.instances.views import (
     InstanceView,
+    ViewId,
     carved,
     hold_distances,
     instance_crops,
@@ -46,7 +47,6 @@ from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import rotation_angle, turns_apart
 from relit.recipe import FitContext
 from relit.rendering.appearance.world_light import shade_world, start_world_light
-from relit.run import run_arrays
 from relit.scene import Mesh
 
 HOLD = 40  # steps of a volume pass of one level before poses move
@@ -67,7 +67,7 @@ CLOSE, CLOSER = (
 
 
 Seek = Callable[
-    [list[InstanceView], np.ndarray, np.ndarray, VolumeModel, Mesh, float], dict[int, np.ndarray]
+    [list[InstanceView], np.ndarray, np.ndarray, VolumeModel, Mesh, float], dict[ViewId, np.ndarray]
 ]  # see `fit.duplicates.recover_unregistered.joiners`
 
 
@@ -80,7 +80,8 @@ class Pass:
     not even. mixed: whether instances were turned then by which the object nearly
     looks like itself: what it has built is of no use. one_sided: whether the shape has turned out
     to be its own mirror image, and silhouettes bounded it from one side only; a body of revolution
-    has no other side. found: poses, by key, of those who are to take part in the next."""
+    has no other side. joining, joining_poses: views that are to take part in the next pass, and
+    their poses (M, 4, 4). values: (n, n, n) distances of its shape."""
 
     poses: np.ndarray
     odd: np.ndarray
@@ -90,28 +91,14 @@ class Pass:
     symmetry: Symmetry | None
     mixed: bool = False
     one_sided: bool = False
-    found: dict[int, np.ndarray] = field(default_factory=dict)
+    joining: tuple[ViewId, ...] = ()
+    joining_poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    values: np.ndarray | None = None
 
     @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What a stage keeps of it, see `pass_from`."""
-        who = {
-            "found": np.array([*self.found], int),
-            "there": np.array([*self.found.values()]).reshape(-1, 4, 4),
-        }
-        off = {} if self.off is None else {"off": self.off}
-        symmetry = self.symmetry.arrays if self.symmetry else {}
-        return {
-            "poses": self.poses,
-            "odd": self.odd,
-            "errors": self.errors,
-            "turn": self.turn,
-            "mixed": self.mixed,
-            "one_sided": self.one_sided,
-            **who,
-            **off,
-            **symmetry,
-        }
+    def found(self) -> dict[ViewId, np.ndarray]:
+        """Poses of the views that are to take part in the next pass."""
+        return dict(zip(self.joining, self.joining_poses, strict=True))
 
     @property
     def exact(self) -> bool:
@@ -134,32 +121,6 @@ class Pass:
         return settled or self.turn < ARRIVED or (self.exact and not self.one_sided)
 
 
-def pass_from(saved: dict[str, np.ndarray]) -> Pass:
-    """The pass that a stage has kept."""
-    nothing = {
-        "mixed": False,
-        "one_sided": False,
-        "errors": np.full(len(saved["poses"]), np.nan),
-        "found": np.zeros(0, int),
-        "there": np.zeros((0, 4, 4)),
-    }
-    saved = nothing | saved  # runs of before have less
-    off = float(saved["off"]) if "off" in saved else None
-    found = dict(zip(saved["found"].tolist(), saved["there"], strict=True))
-    mixed, one_sided = bool(saved["mixed"]), bool(saved["one_sided"])
-    return Pass(
-        saved["poses"],
-        saved["odd"],
-        saved["errors"],
-        float(saved["turn"]),
-        off,
-        symmetry_from(saved),
-        mixed,
-        one_sided,
-        found,
-    )
-
-
 def joint_stages(
     views: list[InstanceView],
     poses: np.ndarray,
@@ -174,7 +135,7 @@ def joint_stages(
     `others` whom the last pass finds (see `fit.duplicates.recover_unregistered.joiners`) take part in more, until poses
     have arrived again, and the rest is sought once more then; where those of before agree clearly
     less for it, all is as it was. seek: of those who are sought, and as Seek."""
-    run, options, seed = fit.run, fit.options, fit.seed
+    run = fit.run
     views, poses, odd, last, arrived, ago = (
         list(views),
         poses.copy(),
@@ -185,21 +146,12 @@ def joint_stages(
     )
     number, end = 0, PASSES
     while True:
-        left = [v for v in others if v.key not in {w.key for w in views}]
+        left = [v for v in others if v.id not in {w.id for w in views}]
         while number < end:
             rest = np.flatnonzero(~odd)
             asked = partial(seek, left) if left and number + 1 < len(JOINT) else None
-            one = joint_stage(
-                [views[k] for k in rest],
-                poses[rest],
-                number,
-                run,
-                options,
-                seed,
-                last,
-                asked,
-                number + 1 == end,
-            )
+            task = PassTask(number, last, asked, number + 1 == end)
+            one = joint_stage([views[k] for k in rest], poses[rest], task, fit)
             poses[rest], odd[rest] = one.poses, one.odd
             last, arrived, number = one, one.arrived(last), number + 1
             if arrived or one.off is None:
@@ -210,9 +162,9 @@ def joint_stages(
         if not last.found:
             return views, poses, odd, arrived, last
         ago, end = ([*views], poses.copy(), odd, arrived, last), min(number + PASSES, len(JOINT))
-        back = [v for v in left if v.key in last.found]
+        back = [v for v in left if v.id in last.found]
         views, odd = [*views, *back], np.append(odd, np.zeros(len(back), bool))
-        poses = np.concatenate([poses, *(last.found[v.key][None] for v in back)])
+        poses = np.concatenate([poses, *(last.found[v.id][None] for v in back)])
 
 
 def worse(before: Pass, after: Pass) -> bool:
@@ -222,74 +174,92 @@ def worse(before: Pass, after: Pass) -> bool:
     return bool(np.nanmedian(after.errors[: len(stayed)]) > WORSE * np.nanmedian(stayed))
 
 
+@dataclass(frozen=True)
+class PassTask:
+    """number: of the pass, from 0. last: the one before. seek: finds the views that take part in the
+    next one, where this is `final`, or poses have arrived with it."""
+
+    number: int
+    last: Pass | None = None
+    seek: Seek | None = None
+    final: bool = False
+
+
 def joint_stage(
-    views: list[InstanceView],
-    poses: np.ndarray,
-    number: int,
-    run,
-    options: DuplicatesOptions,
-    seed: int,
-    last: Pass | None,
-    seek: Seek | None = None,
-    final: bool = False,
+    views: list[InstanceView], poses: np.ndarray, task: PassTask, fit: FitContext
 ) -> Pass:
-    """One such pass. last: the one before. Textures are asked here already: what the pass has built
-    in the wrong place it does not take back. seek: finds those who are to take part in the next
-    one, where this is final, or poses have arrived with it."""
-    name = JOINT[number]
-    if run.done(name):
-        return pass_from(run_arrays(run, name, "joint"))
-    title = f"shape and poses ({ORDINALS[number]} pass)"
-    with run.stage(name, steps=sum(options.level_steps), title=title) as stage:
-        before, off, turned = poses, None, None
-        model, bank, poses = shape_and_poses(
-            views, poses, run, stage, options, seed, last and last.symmetry
+    """One such pass. Textures count here already: what the pass has built in the wrong place it does
+    not take back."""
+    options = fit.options
+
+    def computed(stage) -> Pass:
+        symmetry = task.last and task.last.symmetry
+        model, bank, moved = shape_and_poses(
+            views, poses, fit.run, stage, options, fit.seed, symmetry
         )
-        built = poses.copy()
-        errors = view_errors(bank, model, seed)
-        odd = odd_instances(errors)
-        some = [views[k] for k in np.flatnonzero(~odd)]
-        for k in np.flatnonzero(odd):
-            run.say(
-                f"note: the object with {instance_name(views[k])} is left out: what it shows does not agree with the model of all"
-            )
-        mesh = extract_mesh(dense_values(model.grid), faces=options.faces)
-        if "textures" not in options.without:
-            better, moved, off = followed(mesh, some, poses[~odd], run, options)
-            if off is not None:
-                mesh, poses[~odd] = better, moved
-                if off >= CLOSE or (
-                    last and last.mixed
-                ):  # where textures lie on one another all stand right, but after a mixed pass
-                    turned = resolve_near_symmetry(mesh, some, moved, run, options, seed)
-        turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
-        symmetry = (
-            None
-            if "symmetry" in options.without or turned is not None
-            else find_symmetry(mesh, views, poses)
+        return judged_pass(views, (poses, moved), model, bank, task, fit)
+
+    return fit.run.cached(
+        JOINT[task.number],
+        Pass,
+        computed,
+        steps=sum(options.level_steps),
+        title=f"shape and poses ({ORDINALS[task.number]} pass)",
+    )
+
+
+def judged_pass(
+    views: list[InstanceView],
+    moves: tuple[np.ndarray, np.ndarray],
+    model: VolumeModel,
+    bank: PixelBank,
+    task: PassTask,
+    fit: FitContext,
+) -> Pass:
+    """What a pass gives that has ended with `model`. moves: poses (N, 4, 4) before and after it."""
+    run, options, seed, last = fit.run, fit.options, fit.seed, task.last
+    before, poses = moves[0], moves[1]
+    built, off, turned = poses.copy(), None, None
+    errors = view_errors(bank, model, seed)
+    odd = odd_instances(errors)
+    some = [views[k] for k in np.flatnonzero(~odd)]
+    for k in np.flatnonzero(odd):
+        run.say(
+            f"note: the object with {instance_name(views[k])} is left out: what it shows does not agree with the model of all"
         )
-        if number == 0 and symmetry is not None:
-            run.say("the object is its own mirror image: its silhouettes bound it from both sides")
-        if turned is not None:
-            poses[~odd] = turned
-        one = Pass(
-            poses,
-            odd,
-            errors,
-            turn,
-            off,
-            symmetry,
-            turned is not None,
-            bounded_from_one_side(mesh, symmetry, last),
-        )
-        if seek and turned is None and (off is None or one.arrived(last) or final):
-            one = replace(
-                one,
-                found=seek(
-                    some, built[~odd], poses[~odd], model, mesh, float(np.nanmedian(errors))
-                ),
-            )
-        stage.save("joint", **one.arrays)
+    values = dense_values(model.grid)
+    mesh = extract_mesh(values, faces=options.faces)
+    if "textures" not in options.without:
+        better, moved, off = followed(mesh, some, poses[~odd], run, options)
+        if off is not None:
+            mesh, poses[~odd] = better, moved
+            # where textures lie on one another all poses are right, but after a mixed pass
+            if off >= CLOSE or (last and last.mixed):
+                turned = resolve_near_symmetry(mesh, some, moved, run, options, seed)
+    turn = float(np.median(turns_apart(before[~odd], poses[~odd])))
+    symmetry = None
+    if "symmetry" not in options.without and turned is None:
+        symmetry = find_symmetry(mesh, views, poses)
+    if task.number == 0 and symmetry is not None:
+        run.say("the object is its own mirror image: its silhouettes bound it from both sides")
+    if turned is not None:
+        poses[~odd] = turned
+    one = Pass(
+        poses,
+        odd,
+        errors,
+        turn,
+        off,
+        symmetry,
+        turned is not None,
+        bounded_from_one_side(mesh, symmetry, last),
+        values=values,
+    )
+    if task.seek and turned is None and (off is None or one.arrived(last) or task.final):
+        level = float(np.nanmedian(errors))
+        found = task.seek(some, built[~odd], poses[~odd], model, mesh, level)
+        there = np.array([*found.values()]).reshape(-1, 4, 4)
+        one = replace(one, joining=tuple(found), joining_poses=there)
     return one
 
 
@@ -456,11 +426,6 @@ def related(views: list[InstanceView], poses: np.ndarray, run=None) -> SharedSce
         used = [m for m in scene.motions if m is not None]
         run.say(f"{len(scene.standing)} instances in {len(used)} photos")
     return scene
-
-
-def motion_or_none(motion: np.ndarray | None) -> np.ndarray:
-    """The motion, or none at all where it is not known."""
-    return np.eye(4) if motion is None else motion
 
 
 def light_turns(views: list[InstanceView], scene: SharedScene):

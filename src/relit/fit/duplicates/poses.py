@@ -18,12 +18,12 @@ from relit.fit.duplicates.options import DuplicatesOptions
 from relit.fit.registration.instances.growth import viewing_directions
 from relit.fit.registration.instances.options import Search
 from relit.fit.registration.instances.rounds import ambiguous
-from relit.fit.registration.instances.search import LEFT_OUT
 from relit.fit.registration.instances.trials import place_few
-from relit.fit.registration.instances.views import COARSE, InstanceView, carved, views_of
+from relit.fit.registration.instances.views import COARSE, InstanceView, ViewId, carved, views_of
+from relit.fit.registration.placements import Placements, Status
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import rotation_angle
-from relit.run import run_arrays
+from relit.recipe import FitContext
 from relit.scene import Camera, Pixels
 
 # degrees between what an object shows and what the next one does from which on the search is often
@@ -44,85 +44,92 @@ def all_views(shots: list[Shot], side: int, options: DuplicatesOptions) -> list[
     return out
 
 
-def poses_stage(shots: list[Shot], run, options: DuplicatesOptions, seed: int):
-    """(poses (N, 4, 4) object_from_camera, registered (N,) bool, keys (N,), unsure (N,) degrees,
-    axes (N,) bool) of all views, in the unit frame of the object. unsure: see
-    `instance_rounds.ambiguous`. axes: not registered, but right up to a turn about the object's y
-    axis."""
-    if run.done("poses"):
-        saved = run_arrays(run, "poses", "poses")
-        none = np.zeros(len(saved["labels"]))
-        return (
-            saved["poses"],
-            saved["registered"],
-            saved["labels"],
-            saved.get("unsure", none),
-            saved.get("axes", none > 0),
-        )
+@dataclass(frozen=True)
+class PilePoses:
+    """Poses of all views. ids: names of the views. poses: (N, 4, 4) object_from_camera, in a frame
+    whose unit sphere holds the object. registered: (N,) bool. axis_only: (N,) bool, not registered
+    but right up to a turn about the object's y axis. scores: (N,). turns: (N,) degrees by which a
+    registered instance agrees about as well, 0 where it does not (`ambiguous`)."""
+
+    ids: tuple[ViewId, ...]
+    poses: np.ndarray
+    registered: np.ndarray
+    axis_only: np.ndarray
+    scores: np.ndarray
+    turns: np.ndarray
+
+
+def poses_stage(shots: list[Shot], fit: FitContext) -> PilePoses:
+    """Poses of all views of all photos. Raises UserError where hardly any can be placed."""
+    title = "poses of the instances"
+    return fit.run.cached(
+        "poses", PilePoses, lambda stage: find_pile_poses(shots, fit), title=title
+    )
+
+
+def find_pile_poses(shots: list[Shot], fit: FitContext) -> PilePoses:
+    """Matching, search, and the adjustment over guided matches."""
+    run, options, seed = fit.run, fit.options, fit.seed
     views = all_views(shots, COARSE, options)
-    with run.stage("poses", title="poses of the instances") as stage:
-        matched = (
-            None if "matching" in options.without else match_instances(shots, run, options, seed)
+    matched = None if "matching" in options.without else match_instances(shots, run, options, seed)
+    descents = {"descents": 0} if "refinement" in options.without else {}
+    search = Search(
+        rounds=options.search_rounds,
+        searches=options.searches,
+        regrowths=options.regrowths,
+        **descents,
+    )
+    links = matched.told if matched else ()
+    try:
+        found = place_few(views, search, seed=seed, links=links, say=run.say)
+    except NoShape:
+        raise UserError(
+            "no poses of the instances fit together",
+            "the objects are not identical, the labels are wrong, or too few are seen from near-by sides",
+            "check the label image; more instances, or a photo in which they are larger, help",
+            code=EXIT_FAILED,
+        ) from None
+    registered = registered_of(views, found, links, fit)
+    some = [v for v, ok in zip(views, registered, strict=True) if ok]
+    poses, turns = found.poses, np.zeros(len(views))
+    if registered.sum() > 2 and "refinement" not in options.without:
+        turns[registered] = ambiguous(some, poses[registered], search, seed=seed)
+        say_ambiguous(views, turns, int(registered.sum()), run)
+    say_far_apart(some, poses[registered], run)
+    if matched and not {"guided", "refinement"} & set(options.without):
+        poses = adjusted_poses(matched, poses, registered, run)
+    return PilePoses(
+        ids=tuple(v.id for v in views),
+        poses=centre_poses(views, poses, registered),
+        registered=registered,
+        axis_only=found.having(Status.AXIS_ONLY),
+        scores=found.scores,
+        turns=turns,
+    )
+
+
+def registered_of(
+    views: list[InstanceView], found: Placements, links: tuple, fit: FitContext
+) -> np.ndarray:
+    """(N,) bool: views whose placement counts. Those that agree too little with the model are named;
+    raises UserError where hardly any is left."""
+    placed, scores = found.having(Status.PLACED), found.scores
+    least = np.median(scores[placed]) - AGREES if placed.any() else np.inf
+    registered = placed & (scores >= least)
+    if "search" in fit.options.without and len(views) > 1:
+        registered &= linked_together(len(views), links)
+    if registered.sum() < min(2, len(views)):
+        raise UserError(
+            "hardly any instance could be placed",
+            "see the scores in the log",
+            "check the label image",
+            code=EXIT_FAILED,
         )
-        descents = {"descents": 0} if "refinement" in options.without else {}
-        search = Search(
-            rounds=options.search_rounds,
-            searches=options.searches,
-            regrowths=options.regrowths,
-            **descents,
+    for k in np.flatnonzero(~registered & placed):
+        fit.run.say(
+            f"note: the object with {instance_name(views[k])} is not registered: it agrees with the model of the others by {scores[k]:.2f} only"
         )
-        try:
-            poses, scores = place_few(
-                views, search, seed=seed, links=matched.told if matched else (), say=run.say
-            )
-        except NoShape:
-            raise UserError(
-                "no poses of the instances fit together",
-                "the objects are not identical, the labels are wrong, or too few are seen from near-by sides",
-                "check the label image; more instances, or a photo in which they are larger, help",
-                code=EXIT_FAILED,
-            ) from None
-        registered = scores >= np.median(scores) - AGREES
-        if "search" in options.without and len(views) > 1:
-            registered &= linked_together(len(views), matched.told if matched else ())
-        if registered.sum() < min(2, len(views)):
-            raise UserError(
-                "hardly any instance could be placed",
-                "see the scores in the log",
-                "check the label image",
-                code=EXIT_FAILED,
-            )
-        for k in np.flatnonzero(~registered & (scores > LEFT_OUT)):
-            run.say(
-                f"note: the object with {instance_name(views[k])} is left out: it agrees with the others' model by {scores[k]:.2f} only"
-            )
-        unsure = np.zeros(len(views))
-        if registered.sum() > 2 and "refinement" not in options.without:
-            unsure[registered] = ambiguous(
-                [v for v, ok in zip(views, registered, strict=True) if ok],
-                poses[registered],
-                search,
-                seed=seed,
-            )
-            say_ambiguous(views, unsure, int(registered.sum()), run)
-        say_far_apart(
-            [v for v, ok in zip(views, registered, strict=True) if ok], poses[registered], run
-        )
-        if matched and not {"guided", "refinement"} & set(options.without):
-            poses = adjusted_poses(matched, poses, registered, run)
-        poses = centre_poses(views, poses, registered)
-        keys = np.array([v.key for v in views])
-        axes = scores == LEFT_OUT
-        stage.save(
-            "poses",
-            poses=poses,
-            registered=registered,
-            labels=keys,
-            scores=scores,
-            unsure=unsure,
-            axes=axes,
-        )
-    return poses, registered, keys, unsure, axes
+    return registered
 
 
 def linked_together(count: int, told: tuple) -> np.ndarray:

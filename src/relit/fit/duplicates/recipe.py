@@ -25,7 +25,7 @@ i has the pose world_from_camera (object_from_camera_i)^-1.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,25 +35,23 @@ from relit.errors import UserError
 from relit.fit.duplicates.azimuth_refinement import SCENES, turned_as_shown
 from relit.fit.duplicates.ground_paint import ground_as_shown
 from relit.fit.duplicates.indirect_light import ASLANT, HiddenLight, hidden_from
-from relit.fit.duplicates.lit_pile import lit_pile, pile_surface_options
+from relit.fit.duplicates.lit_pile import LitPile, lit_pile, pile_surface_options
 from relit.fit.duplicates.options import WITHOUT, DuplicatesOptions, options_for
-from relit.fit.duplicates.poses import all_views, instance_name, poses_stage
+from relit.fit.duplicates.placed_pile import PlacedPile
+from relit.fit.duplicates.poses import PilePoses, Shot, all_views, instance_name, poses_stage
 from relit.fit.duplicates.scene import ground_colour, ground_reflectance, light_below
-from relit.fit.duplicates.shape import shape_stages
+from relit.fit.duplicates.shape import FoundViews, shape_stages
 from relit.fit.duplicates.vessels import body_axis
 from relit.fit.passes.first_material import PAINT, first_material
 from relit.fit.passes.material_priors import ALBEDO_START
-from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
-from relit.fit.registration.instances.views import ANOTHER_PHOTO, InstanceView
-from relit.fit.shape.inpaint import painted_over
+from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.registration.instances.views import InstanceView, ViewId
+from relit.fit.shape.mesh_stage import TexelMap, texels_of
 from relit.fit.shape.unseen import seen_faces
-from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
 from relit.geometry.se3 import nearest_rotation, rotation_angle, rotation_from
 from relit.lighting.gaussian_light import GaussianLight
 from relit.materials.field import normal_map, pictures
 from relit.recipe import FitContext, ObjectCost, Recipe
-from relit.rendering.transport import NO_TEXELS
-from relit.run import run_arrays
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 from relit.settings import check_levels
 
@@ -77,30 +75,28 @@ def reconstruct(capture: Capture, run, options: DuplicatesOptions, seed: int = 0
         and all(pixels.normal is None for pixels, _ in shots)
     ):
         run.say("note: without=normals changes nothing: no photo has normal priors")
-    poses, registered, keys, unsure, axes = poses_stage(shots, run, options, seed)
-    on_axes = {int(k): p for k, p, one in zip(keys, poses, axes, strict=True) if one}
-    shown = [v for v in all_views(shots, options.side, options) if v.key in keys]
-    views, others = (
-        [v for v in shown if (v.key in keys[registered]) == placed] for placed in (True, False)
-    )
-    poses = poses[registered]
-    if run.done("mesh"):
-        parts = run_arrays(run, "mesh", "mesh")
-    else:
-        parts = shape_stages(shots, views, poses, others, on_axes, fit)
-    mesh = Mesh(parts["vertices"], parts["faces"], parts["normals"], parts["uvs"])
+    poses = poses_stage(shots, fit)
+    shown = {v.id: v for v in all_views(shots, options.side, options)}
+    pile = shape_stages(shots, found_views(poses, shown), fit)
     camera = photos[0].camera
-    maps = (
-        run_arrays(run, "surface", "maps")
-        if run.done("surface")
-        else surface_stage(shots, camera, mesh, parts, fit)
-    )
-    doubts = dict(zip(keys.tolist(), unsure.tolist(), strict=True))
-    asset = assemble(photos, mesh, maps, parts, doubts)
-    if len(parts.get("vague", ())):
-        parts = parts | {"poses": turns_stage(asset, mesh, shown, camera, parts, run, seed)}
-        asset = assemble(photos, mesh, maps, parts, doubts)
+    maps = surface_stage(shots, camera, pile, fit)
+    asset = assemble(photos, pile, maps, poses)
+    if pile.guessed:
+        turned = turns_stage(asset, pile, [*shown.values()], camera, fit)
+        asset = assemble(photos, turned, maps, poses)
     return ground_as_shown(asset, shots[0][0], seed)
+
+
+def found_views(found: PilePoses, shown: dict[ViewId, InstanceView]) -> FoundViews:
+    """The views by what the search has found of them."""
+    views = [(shown[i], k) for k, i in enumerate(found.ids) if i in shown]
+    placed = [k for _, k in views if found.registered[k]]
+    return FoundViews(
+        [v for v, k in views if found.registered[k]],
+        found.poses[placed],
+        [v for v, k in views if not found.registered[k]],
+        {i: found.poses[k] for k, i in enumerate(found.ids) if found.axis_only[k]},
+    )
 
 
 def labelled_photos(capture: Capture) -> tuple:
@@ -128,127 +124,153 @@ def with_normals(pixels: Pixels, options: DuplicatesOptions) -> Pixels:
 # ---------------------------------------------------------------- material and light
 
 
+@dataclass(frozen=True)
+class PileMaterial:
+    """Textures (S, S[, 3]) of a metallic-roughness material, linear: base_color, roughness,
+    metallic, normal (tangent space). environment: (H, 2 H, 3) radiance, lat-long in the scene frame.
+    ground_colour: (3,) base colour of the ground."""
+
+    base_color: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    normal: np.ndarray
+    environment: np.ndarray
+    ground_colour: np.ndarray
+
+
 def surface_stage(
-    shots, camera: Camera, mesh: Mesh, parts, fit: FitContext
-) -> dict[str, np.ndarray]:
+    shots: list[Shot], camera: Camera, pile: PlacedPile, fit: FitContext
+) -> PileMaterial:
     """Material and light, in the scene frame: the world's axes, unit lengths of the object, the
-    origin in the middle of the pile. What no instance shows is painted like what is next to it.
-    Returns (and keeps) base_color, roughness, metallic, normal, environment and ground_colour."""
-    run, options, seed = fit.run, fit.options, fit.seed
-    o = pile_surface_options(options)
-    with run.stage("surface", steps=o.steps, title="material and light (surface pass)") as stage:
-        up = camera.world_from_camera[:3, :3] @ parts["plane"][1] if len(parts["plane"]) else None
-        ground_level = ground_colour(shots[0][0], parts["plane"])
-        lit = lit_pile(
-            shots, camera, mesh, parts, options.max_pixels, alone="visibility" in options.without
-        )
-        bank, traced, level = lit.bank, lit.traced, lit.level
-        face, bary = rasterise_atlas(mesh, o.texture)
-        known = face >= 0
-        start = fill_gutters(interpolate(parts["base"], mesh.faces, face, bary), known)
-        metallic = PAINT
-        if "first_material" not in options.without and stage.load("checkpoint") is None:
-            # metal alone: each texel stands in many places under the light here, so that roughness
-            # finds its way from anywhere
-            progress = run.progress("metal or paint")
-            metallic, _ = first_material(
-                bank, traced, start, known, level, None, o, seed, progress, dullness=False
-            )
-            run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
-        model = start_surface(start, known, level, o, None, metallic)
-        if options.gaussians:
-            model.gaussians = GaussianLight(
-                options.gaussians, o.light, max(level, 1e-4) / ALBEDO_START
-            )
+    origin in the middle of the pile. Texels that no instance shows continue the shown ones. camera:
+    of the first photo."""
+    o, options = pile_surface_options(fit.options), fit.options
+
+    def computed(stage) -> PileMaterial:
+        alone = "visibility" in options.without
+        lit = lit_pile(shots, camera, pile, options.max_pixels, alone=alone)
+        texels = texels_of(pile.mesh, o.texture)
+        model = start_of_surface(lit, pile, texels, stage, fit)
         gathered = None
         if "hidden" not in options.without and not lit.alone:
-            gathered = HiddenLight(
-                traced, hidden_from(traced, lit.cameras), traced.mesh.uvs[:, 0] < NO_TEXELS
-            ).before
-        fit_surface(EnvironmentTerms(bank, traced, model, o, seed, gathered), stage)
+            hidden = hidden_from(lit.traced, lit.cameras)
+            gathered = HiddenLight(lit.traced, hidden, lit.traced.only_blocks).before
+        fit_surface(EnvironmentTerms(lit.bank, lit.traced, model, o, fit.seed, gathered), stage)
         names = ("base_color", "roughness", "metallic")
-        paint = {
-            n: fill_gutters(t, known) for n, t in zip(names, pictures(model.material), strict=True)
-        }
-        told = parts["view_instances"][
-            ~np.isin(parts["view_keys"], parts.get("vague", ()))
-        ]  # who is turned by guess paints nothing
-        which = np.isin(np.arange(len(parts["poses"])), told)
-        paint = painted_over(mesh, shown_faces(lit.pile, which, lit.cameras), paint, face, bary)
-        environment = model.environment.image()
-        ground = ground_level
-        if up is not None:
-            ground = ground_reflectance(environment, up, ground_level)
-            environment = light_below(environment, up, ground_level)
-        maps = {
-            **paint,
-            "normal": normal_map(model.material),
-            "environment": environment,
-            "ground_colour": ground,
-        }
-        stage.save("maps", **maps)
-    return maps
+        paint = dict(zip(names, pictures(model.material), strict=True))
+        # an instance with a guessed azimuth contributes no texture
+        seen = shown_faces(lit.instances, pile.with_known_turn, lit.cameras)
+        environment, ground = model.environment.image(), ground_colour(shots[0][0], pile.plane)
+        if pile.plane is not None:
+            up, level = camera.world_from_camera[:3, :3] @ pile.plane[1], ground
+            ground = ground_reflectance(environment, up, level)
+            environment = light_below(environment, up, level)
+        return PileMaterial(
+            **texels.painted(paint, seen),
+            normal=normal_map(model.material),
+            environment=environment,
+            ground_colour=ground,
+        )
+
+    title = "material and light (surface pass)"
+    return fit.run.cached("surface", PileMaterial, computed, steps=o.steps, title=title)
 
 
-def shown_faces(pile: Mesh, which: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+def start_of_surface(
+    lit: LitPile, pile: PlacedPile, texels: TexelMap, stage, fit: FitContext
+) -> SurfaceModel:
+    """The material and light that the surface pass begins with."""
+    run, options, o, known = fit.run, fit.options, pile_surface_options(fit.options), texels.known
+    start, metallic = texels.spread(pile.base), PAINT
+    if "first_material" not in options.without and stage.load("checkpoint") is None:
+        # metal alone: each texel stands in many places under the light here, so that roughness
+        # finds its way from anywhere
+        progress = run.progress("metal or paint")
+        metallic, _ = first_material(
+            lit.bank,
+            lit.traced,
+            start,
+            known,
+            lit.level,
+            None,
+            o,
+            fit.seed,
+            progress,
+            dullness=False,
+        )
+        run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
+    model = start_surface(start, known, lit.level, o, None, metallic)
+    if options.gaussians:
+        level = max(lit.level, 1e-4) / ALBEDO_START
+        model.gaussians = GaussianLight(options.gaussians, o.light, level)
+    return model
+
+
+def shown_faces(instances: Mesh, which: np.ndarray, cameras: list[Camera]) -> np.ndarray:
     """(F,) bool: faces of the object that some camera sees, not all too aslant, on one of the
-    instances `which` (K,) bool. All K come first in the pile."""
-    seen = seen_faces(pile, cameras, ASLANT)
-    instances = (pile.uvs[pile.faces[:, 0], 0] > NO_TEXELS).sum()
-    return seen[:instances].reshape(len(which), -1)[which].any(0)
+    instances `which` (K,) bool. instances: all K, one after the other."""
+    seen = seen_faces(instances, cameras, ASLANT)
+    return seen.reshape(len(which), -1)[which].any(0)
+
+
+@dataclass(frozen=True)
+class TurnedPoses:
+    """poses: (K, 4, 4) object_from_first_photo of all instances."""
+
+    poses: np.ndarray
 
 
 def turns_stage(
-    asset: Asset, mesh: Mesh, views: list[InstanceView], camera: Camera, parts, run, seed: int
+    asset: Asset, pile: PlacedPile, views: list[InstanceView], camera: Camera, fit: FitContext
+) -> PlacedPile:
+    """The pile with the guessed turns of instances as the photo shows them."""
+    title = "turns about the axis"
+    turned = fit.run.cached(
+        "turns",
+        TurnedPoses,
+        lambda stage: TurnedPoses(turned_poses(asset, pile, views, camera, fit)),
+        title=title,
+    )
+    return replace(pile, poses=turned.poses)
+
+
+def turned_poses(
+    asset: Asset, pile: PlacedPile, views: list[InstanceView], camera: Camera, fit: FitContext
 ) -> np.ndarray:
-    """Poses (K, 4, 4) of all instances as in `parts`, with those that were turned by guess as the
-    photo shows them."""
-    if run.done("turns"):
-        return run_arrays(run, "turns", "turns")["poses"]
-    poses, keys = parts["poses"].copy(), parts["keys"].tolist()
-    with run.stage("turns", title="turns about the axis") as stage:
-        axis, guessed = (
-            body_axis(mesh),
-            [v for v in views if v.key in parts["vague"] and v.key in keys],
+    """See `turns_stage`: (K, 4, 4)."""
+    run, poses = fit.run, pile.poses.copy()
+    axis = body_axis(pile.mesh)
+    guessed = [v for v in views if v.id in pile.guessed and v.id in pile.ids]
+    if axis is None or not guessed:
+        return poses
+    own = [pile.ids.index(v.id) for v in guessed]
+    cameras = [
+        v.camera.with_pose(camera.world_from_camera @ pile.motions[v.photo]) for v in guessed
+    ]
+    before = poses[own] @ camera.camera_from_world
+    progress = run.progress("turns about the axis", SCENES)
+    after = turned_as_shown(asset, guessed, cameras, before, axis, fit.seed, progress)
+    for view, a, b in zip(guessed, before, after, strict=True):
+        turn = rotation_angle(a[:3, :3].T @ b[:3, :3])
+        run.say(
+            f"the object with {instance_name(view)}, rendered, differs least from the photo when it is turned by {turn:.0f} degrees"
         )
-        if axis is not None and guessed:
-            own = [keys.index(v.key) for v in guessed]
-            cameras = [
-                v.camera.with_pose(camera.world_from_camera @ parts["motions"][v.photo])
-                for v in guessed
-            ]
-            before = poses[own] @ camera.camera_from_world
-            after = turned_as_shown(
-                asset,
-                guessed,
-                cameras,
-                before,
-                axis,
-                seed,
-                run.progress("turns about the axis", SCENES),
-            )
-            for view, a, b in zip(guessed, before, after, strict=True):
-                turn = rotation_angle(a[:3, :3].T @ b[:3, :3])
-                run.say(
-                    f"the object with {instance_name(view)}, rendered, differs least from the photo when it is turned by {turn:.0f} degrees"
-                )
-            poses[own] = after @ camera.world_from_camera
-        stage.save("turns", poses=poses)
+    poses[own] = after @ camera.world_from_camera
     return poses
 
 
 # ---------------------------------------------------------------- asset
 
 
-def assemble(photos, mesh: Mesh, maps, parts, keys: dict[int, float]) -> Asset:
+def assemble(photos, pile: PlacedPile, maps: PileMaterial, found: PilePoses) -> Asset:
     """The asset: the object +Y up where a ground was found (as the first instance stands), its
     instances in the user's world, whose unit is the unit of the fit (one photo does not know the
-    scale). keys: of the instances, each with the degrees by which it may be turned as well, or
-    0."""
+    scale)."""
     world_from_photo = photos[0].camera.world_from_camera
-    world_from_unit = [world_from_photo @ np.linalg.inv(p) for p in parts["poses"]]
-    plane = parts["plane"]
-    up = world_from_photo[:3, :3] @ plane[1] if len(plane) else np.array([0.0, 1.0, 0.0])
+    world_from_unit = [world_from_photo @ np.linalg.inv(p) for p in pile.poses]
+    up = np.array([0.0, 1.0, 0.0])
+    if pile.plane is not None:
+        up = world_from_photo[:3, :3] @ pile.plane[1]
     # the instance whose own axes are turned least stands for all
     asset_from_unit = similarity(
         nearest_rotation(
@@ -257,49 +279,52 @@ def assemble(photos, mesh: Mesh, maps, parts, keys: dict[int, float]) -> Asset:
         np.zeros(3),
     )
     placed = replace(
-        mesh,
-        vertices=move_points(asset_from_unit, mesh.vertices).astype(np.float32),
-        normals=(mesh.normals @ asset_from_unit[:3, :3].T).astype(np.float32),
+        pile.mesh,
+        vertices=move_points(asset_from_unit, pile.mesh.vertices).astype(np.float32),
+        normals=(pile.mesh.normals @ asset_from_unit[:3, :3].T).astype(np.float32),
     )
     world_from_object = [m @ np.linalg.inv(asset_from_unit) for m in world_from_unit]
-    instances = []
-    placed_keys, shown = parts["keys"].tolist(), parts["view_keys"].tolist()
-    for key, other in keys.items():
-        if key in placed_keys:
-            doubt = (
-                f"ambiguous: turned by {other:.0f} degrees it agrees about as well" if other else ""
-            )
-            if key in parts.get("vague", ()):
-                doubt = "ambiguous: its turn about the axis of the object is a guess"
-            instances.append(Instance(key, world_from_object[placed_keys.index(key)], doubt))
-        elif key not in shown and (key < ANOTHER_PHOTO or parts["related"][key // ANOTHER_PHOTO]):
-            instances.append(
-                Instance(key, None, "it agrees too little with the model of the others")
-            )
     ground = None
-    if len(plane):
-        point = move_points(world_from_photo, plane[0])
+    if pile.plane is not None:
+        point = move_points(world_from_photo, pile.plane[0])
         reach = max(np.linalg.norm(m[:3, 3] - point) for m in world_from_object) + 1.0
-        ground = Ground(point, up, 4 * float(reach), maps["ground_colour"])
-    material = Material(
-        maps["base_color"], maps["roughness"], maps["metallic"], normal=maps["normal"]
-    )
+        ground = Ground(point, up, 4 * float(reach), maps.ground_colour)
     cameras = tuple(
         (p.name, p.camera.with_pose(world_from_photo @ motion))
-        for p, motion, known in zip(photos, parts["motions"], parts["related"], strict=True)
+        for p, motion, known in zip(photos, pile.motions, pile.related, strict=True)
         if known
     )
     return Asset(
         placed,
-        material,
+        Material(maps.base_color, maps.roughness, maps.metallic, normal=maps.normal),
         world_from_object[0],
-        maps["environment"],
+        maps.environment,
         cameras,
         {},
         None,
-        instances=tuple(instances),
+        instances=listed_instances(pile, world_from_object, found),
         ground=ground,
     )
+
+
+def listed_instances(
+    pile: PlacedPile, world_from_object: list[np.ndarray], found: PilePoses
+) -> tuple[Instance, ...]:
+    """All instances, with the reason where a pose is missing or uncertain."""
+    out = []
+    for name, turn in zip(found.ids, found.turns, strict=True):
+        if name in pile.ids:
+            doubt = (
+                f"ambiguous: turned by {turn:.0f} degrees it agrees about as well" if turn else ""
+            )
+            if name in pile.guessed:
+                doubt = "ambiguous: its turn about the axis of the object is a guess"
+            pose = world_from_object[pile.ids.index(name)]
+            out.append(Instance(name.label, pose, doubt, name.photo))
+        elif name not in pile.views and pile.related[name.photo]:
+            reason = "it agrees too little with the model of the others"
+            out.append(Instance(name.label, None, reason, name.photo))
+    return tuple(out)
 
 
 RECIPE = Recipe(

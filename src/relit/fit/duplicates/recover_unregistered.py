@@ -23,7 +23,7 @@ from relit.fit.passes.volume import VolumeModel
 from relit.fit.registration.instances.azimuth import others_of, turned_alike
 from relit.fit.registration.instances.outliers import LEAST, MOST, view_errors
 from relit.fit.registration.instances.recovery import galleries_of, sought_again
-from relit.fit.registration.instances.views import InstanceView
+from relit.fit.registration.instances.views import InstanceView, ViewId
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import nearest_rotation
@@ -44,8 +44,8 @@ def joiners(
     run,
     options: DuplicatesOptions,
     seed: int,
-) -> dict[int, np.ndarray]:
-    """Poses, by key, of those of `others` who are to take part in the next pass: what shows them is
+) -> dict[ViewId, np.ndarray]:
+    """Poses, by view, of those of `others` who are to take part in the next pass: what shows them is
     found in the model of this one, or nearly. So few are taken that they are told to be odd if they
     stand wrong (fit/registration/instances/outliers.py).
 
@@ -70,7 +70,7 @@ def joiners(
             run.say(
                 f"the object with {instance_name(view)} {so} found in the model of the others: it takes part in the next pass"
             )
-            found[view.key] = pose
+            found[view.id] = pose
     return carried(found, poses, after)
 
 
@@ -95,7 +95,7 @@ def with_found(
     views: list[InstanceView],
     poses: np.ndarray,
     others: list[InstanceView],
-    on_axes: dict[int, np.ndarray],
+    on_axes: dict[ViewId, np.ndarray],
     model: VolumeModel,
     bank: PixelBank,
     run,
@@ -110,7 +110,7 @@ def with_found(
     seek = seeker(views, poses, model, level, seed)
     found, vague, turned = [], [], turned_by_others(mesh, views, poses)
     for view in others:
-        pose, sure = seek(view, on_axis=on_axes.get(view.key), turned=turned)
+        pose, sure = seek(view, on_axis=on_axes.get(view.id), turned=turned)
         if pose is not None and not sure:
             run.say(
                 f"note: the object with {instance_name(view)} is placed on its axis; its turn about that is a guess"
@@ -148,8 +148,8 @@ def turned_by_others(mesh: Mesh, views: list[InstanceView], poses: np.ndarray):
 
 
 def carried(
-    some: dict[int, np.ndarray], before: np.ndarray, after: np.ndarray
-) -> dict[int, np.ndarray]:
+    some: dict[ViewId, np.ndarray], before: np.ndarray, after: np.ndarray
+) -> dict[ViewId, np.ndarray]:
     """Poses of the object's frame before passes that have moved it, in that after them: by the
     similarity that those (N, 4, 4) tell which have gone along."""
     turn = nearest_rotation(np.sum(after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1), 0))

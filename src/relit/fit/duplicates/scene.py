@@ -8,7 +8,7 @@ the pile.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -20,10 +20,12 @@ from relit.conventions import (
     move_points,
     similarity,
 )
+from relit.fit.duplicates.placed_pile import PlacedPile
 from relit.fit.passes.pixels import make_bank
 from relit.fit.registration.instances.views import nearest_pixels
 from relit.reference.pile import ground_square
-from relit.scene import Camera, Ground, Mesh
+from relit.rendering.transport import Blockers, TraceableMesh
+from relit.scene import Camera, Ground, Mesh, Pixels
 
 TOUCHES = 0.08  # unit lengths within which an instance counts as touching the ground
 SETTLED = 4  # instances that must touch the ground before their distances follow it
@@ -52,9 +54,9 @@ Distance = Callable[
 ]  # of points (..., 3) in the object's frame from its surface, negative inside
 
 
-def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray | None:
     """Point and unit normal, (2, 3), in the photo's frame (unit lengths) of the plane that most
-    instances touch with all of them on the camera's side; (0, 3) where fewer than three touch
+    instances touch with all of them on the camera's side; None where fewer than three touch
     one."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -62,12 +64,12 @@ def find_ground(vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
         move_points(np.linalg.inv(p), vertices[:: max(1, len(vertices) // 4000)]) for p in poses
     ]
     if len(standing) < 3:
-        return np.zeros((0, 3))
+        return None
     try:
         hull = ConvexHull(np.concatenate(standing))
     except QhullError:
-        return np.zeros((0, 3))
-    best, found = 2, np.zeros((0, 3))
+        return None
+    best, found = 2, None
     for normal, offset in {tuple(np.round(e, 3)): (e[:3], e[3]) for e in hull.equations}.values():
         up = -normal
         if -offset <= 0:  # the camera (the origin) must stand above
@@ -244,41 +246,60 @@ def alone_bank(
     return photo_bank(cut, own, labels, max_pixels)
 
 
-def scene_mesh(
-    mesh: Mesh, parts, standing, scene_from_photo, pixels, camera: Camera, moves=None
+@dataclass(frozen=True)
+class PileScene:
+    """Meshes in the scene frame, linear radiance (V, 3) of their vertices. instances: all of them,
+    one after the other. ground: carries no texels and only blocks, or None."""
+
+    instances: Mesh
+    radiance: np.ndarray
+    ground: Blockers | None
+
+    def traceable(self) -> TraceableMesh:
+        return TraceableMesh(self.instances, self.radiance, self.ground)
+
+
+def instance_meshes(
+    pile: PlacedPile, scene_from_photo: np.ndarray, moves: np.ndarray | None = None
 ) -> tuple[Mesh, np.ndarray]:
-    """All instances and the ground as one mesh in the scene frame, and the radiance (V, 3) of its
-    vertices. Faces with negative texture coordinates only block (the ground). moves: (N, 3) of
-    `spread_moves`, where no instance, and no ground, is to shadow another; or None."""
-    vertices, normals, faces, uvs, radiance, count = [], [], [], [], [], 0
-    for k, pose in enumerate(standing):
-        m = scene_from_photo @ pose
-        m = m if moves is None else similarity(np.eye(3), moves[k]) @ m
-        vertices.append(move_points(m, mesh.vertices))
-        normals.append(mesh.normals @ m[:3, :3].T)
-        faces.append(mesh.faces.astype(np.int64) + count)
-        uvs.append(mesh.uvs)
-        radiance.append(parts["radiance"][k])
-        count += len(mesh.vertices)
-    if len(parts["plane"]) and moves is None:
-        point, normal = (
-            move_points(scene_from_photo, parts["plane"][0]),
-            scene_from_photo[:3, :3] @ parts["plane"][1],
-        )
-        reach = 4 * max(np.linalg.norm(v - point, axis=1).max() for v in vertices)
-        v, f = ground_square(Ground(point, normal, reach, np.ones(3)), GROUND_ROWS)
-        vertices.append(v)
-        normals.append(np.repeat(normal[None], len(v), 0))
-        faces.append(f + count)
-        uvs.append(-1.0 - (v - v.min(0))[:, [0, 2]] / np.maximum(np.ptp(v, axis=0)[[0, 2]], 1e-6))
-        radiance.append(ground_radiance(v, scene_from_photo, pixels, camera))
-    whole = Mesh(
-        np.concatenate(vertices).astype(np.float32),
-        np.concatenate(faces).astype(np.int32),
-        np.concatenate(normals).astype(np.float32),
-        np.concatenate(uvs).astype(np.float32),
+    """All instances as one mesh in the scene frame, and the radiance (V, 3) of its vertices. moves:
+    (K, 3) of `spread_moves`, or None."""
+    mesh, count = pile.mesh, len(pile.mesh.vertices)
+    places = [scene_from_photo @ np.linalg.inv(p) for p in pile.poses]
+    if moves is not None:
+        places = [similarity(np.eye(3), s) @ m for s, m in zip(moves, places, strict=True)]
+    together = Mesh(
+        np.concatenate([move_points(m, mesh.vertices) for m in places]).astype(np.float32),
+        np.concatenate(
+            [mesh.faces.astype(np.int64) + k * count for k in range(len(places))]
+        ).astype(np.int32),
+        np.concatenate([mesh.normals @ m[:3, :3].T for m in places]).astype(np.float32),
+        np.concatenate([mesh.uvs for _ in places]).astype(np.float32),
     )
-    return whole, np.concatenate(radiance).astype(np.float32)
+    return together, np.concatenate(list(pile.radiance)).astype(np.float32)
+
+
+def pile_scene(
+    pile: PlacedPile, scene_from_photo: np.ndarray, pixels: Pixels, camera: Camera
+) -> PileScene:
+    """All instances and the ground, where there is one, in the scene frame. pixels, camera: of the
+    first photo."""
+    mesh, radiance = instance_meshes(pile, scene_from_photo)
+    if pile.plane is None:
+        return PileScene(mesh, radiance, None)
+    point = move_points(scene_from_photo, pile.plane[0])
+    normal = scene_from_photo[:3, :3] @ pile.plane[1]
+    reach = 4 * float(np.linalg.norm(mesh.vertices - point, axis=1).max())
+    v, f = ground_square(Ground(point, normal, reach, np.ones(3)), GROUND_ROWS)
+    uvs = (v - v.min(0))[:, [0, 2]] / np.maximum(np.ptp(v, axis=0)[[0, 2]], 1e-6)
+    ground = Mesh(
+        v.astype(np.float32),
+        f.astype(np.int32),
+        np.repeat(normal[None], len(v), 0).astype(np.float32),
+        uvs.astype(np.float32),
+    )
+    shown = ground_radiance(v, scene_from_photo, pixels, camera).astype(np.float32)
+    return PileScene(mesh, radiance, Blockers(ground, shown))
 
 
 def ground_radiance(
@@ -293,10 +314,11 @@ def ground_radiance(
     return np.where(ok[:, None], pixels.rgb[y, x], usual)
 
 
-def ground_colour(pixels, plane: np.ndarray) -> np.ndarray:
-    """(3,) median radiance of what is no object."""
+def ground_colour(pixels, plane: np.ndarray | None) -> np.ndarray:
+    """(3,) median radiance of what is no object; 0 without a ground."""
     free = pixels.labels == 0
-    return np.median(pixels.rgb[free], axis=0) if free.any() and len(plane) else np.zeros(3)
+    known = free.any() and plane is not None
+    return np.median(pixels.rgb[free], axis=0) if known else np.zeros(3)
 
 
 def ground_reflectance(environment: np.ndarray, up: np.ndarray, radiance: np.ndarray) -> np.ndarray:

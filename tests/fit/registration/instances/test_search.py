@@ -41,11 +41,10 @@ from relit.fit.registration.instances.rounds import (
     trusted,
 )
 from relit.fit.registration.instances.search import (
-    TORN,
+    deferred_until_the_end,
     first_starts,
     grown_from_pairs,
     place,
-    without_torn,
 )
 from relit.fit.registration.instances.views import (
     albedo_render,
@@ -376,22 +375,14 @@ def test_what_doubt_moves_is_kept_only_where_all_agree_no_worse(monkeypatch):
     assert asked[:2] == [set(), {2}]  # who was brought back is not asked again
 
 
-def test_who_is_torn_is_left_to_the_end_where_it_can_be_spared():
+def test_contested_instances_are_deferred():
     said, view = [], SimpleNamespace(label=7)
-    left = without_torn([view] * 10, np.full(10, 0.9), {1, 4}, said.append)
-    assert (
-        np.flatnonzero(left == TORN).tolist() == [1, 4]
-        and left.max() == 0.9
-        and "7, 7 may stand wrong" in said[0]
-    )
-    for count, torn in (
-        (10, set()),
-        (10, {1, 2, 3}),
-        (8, {1}),
-    ):  # none, too many of all, too few would be left
-        assert (
-            without_torn([view] * count, np.full(count, 0.9), torn, said.append) == 0.9
-        ).all() and len(said) == 1
+    assert deferred_until_the_end([view] * 10, {1, 4}, said.append) == [1, 4]
+    assert "7, 7 are contested" in said[0]
+    # none, too many of all, too few would be left
+    for count, contested in ((10, set()), (10, {1, 2, 3}), (8, {1})):
+        assert deferred_until_the_end([view] * count, contested, said.append) == []
+    assert len(said) == 1
 
 
 def test_a_link_from_matching_gives_a_pose_from_either_side():
@@ -727,4 +718,4 @@ def test_the_ground_is_the_plane_that_most_instances_touch():
     point, normal = find_ground(body, np.array(poses))
     assert normal @ up > 0.995
     assert (np.array([0, 0, 12.0]) - point) @ up == pytest.approx(0.8, abs=0.08)
-    assert len(find_ground(body, np.array(poses[:2]))) == 0
+    assert find_ground(body, np.array(poses[:2])) is None

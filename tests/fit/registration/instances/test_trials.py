@@ -6,8 +6,8 @@ import pytest
 from relit.conventions import similarity
 from relit.fit.registration.instances import trials as instance_trials
 from relit.fit.registration.instances.options import Search
-from relit.fit.registration.instances.search import SearchResult
 from relit.fit.registration.instances.trials import SAME, place_few, turned_apart
+from relit.fit.registration.placements import all_placed
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import exp_so3
 
@@ -53,14 +53,14 @@ def search(monkeypatch):
             one = left.pop(0)
             if isinstance(one, Exception):
                 raise one
-            return SearchResult(one, np.full(len(one), 0.9), sure)
+            return all_placed(one, np.full(len(one), 0.9), sure)
 
         monkeypatch.setattr(instance_trials, "place", place)
         monkeypatch.setattr(
             instance_trials, "model_of_all", lambda *_, **__: (None, np.full(count, told.pop(0)))
         )
-        got, _ = place_few([None] * count, Search(**options), seed=7, say=said.append)
-        return got, said, seeds
+        got = place_few([None] * count, Search(**options), seed=7, say=said.append)
+        return got.poses, said, seeds
 
     return run
 

@@ -16,8 +16,6 @@ coherent_turns  as up_to_turns, of the final poses
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from relit.fit.registration.instances.growth import grow_instances
@@ -45,6 +43,7 @@ from relit.fit.registration.instances.views import (
     frame_scale,
     instance_crops,
 )
+from relit.fit.registration.placements import Placements, Status, all_placed
 from relit.fit.registration.register import Rings, crop_rings
 from relit.geometry.hull import NoShape
 
@@ -54,22 +53,6 @@ SPARED, ENOUGH = (
     # share of the instances that can be left to the end, and those whose model is to say where they
     # stand
 )
-TORN = -3.0  # score of such an instance
-# score of an instance whose turn about a known axis is not told; that of a place that shows nothing
-# is -1
-LEFT_OUT = -2.0
-
-
-@dataclass(frozen=True)
-class SearchResult:
-    """What a search has found. poses: (N, 4, 4) object_from_camera, scores: (N,) of all instances,
-    LEFT_OUT where the turn about the axis is not told. sure: nearly all of them were sure of their
-    places and agree about as well as the others (`instance_regrowth.believed`), or another search
-    would find the same."""
-
-    poses: np.ndarray
-    scores: np.ndarray
-    sure: bool
 
 
 def first_starts(
@@ -107,21 +90,21 @@ def first_starts(
     return [[*guessed, *told][b] for b in order]
 
 
-def by_axes(revolved: Placed, say) -> SearchResult:
+def by_axes(revolved: Placed, say) -> Placements:
     """Bodies of revolution as outlines and decoration have them: a search over all poses would lose
-    the axes. Where most are sure of their turn the others are left out, to be sought in the
-    finished model of these."""
-    scores, unsure = revolved.own.copy(), list(revolved.unsure)
+    the axes. Where most are sure of their turn the others are deferred to the final model."""
+    scores, unsure = revolved.own, list(revolved.unsure)
+    found = all_placed(revolved.poses, scores, True)
     if unsure and mostly_sure(revolved):
-        scores[unsure] = LEFT_OUT
+        found.status[unsure] = Status.AXIS_ONLY
         say(
-            f"note: {len(unsure)} of {len(scores)} are not sure of their turn about the axis: they are left to the end"
+            f"note: {len(unsure)} of {len(scores)} azimuths about the axis are uncertain: deferred until the final model"
         )
     elif unsure:
         say(
-            f"note: {len(unsure)} of {len(scores)} are not sure of their turn about the axis: their decoration may be mixed"
+            f"note: {len(unsure)} of {len(scores)} azimuths about the axis are uncertain: their decoration may be mixed"
         )
-    return SearchResult(revolved.poses, scores, True)
+    return found
 
 
 def place(
@@ -132,14 +115,14 @@ def place(
     links=(),
     say=lambda text: None,
     step=lambda done, total: None,
-) -> SearchResult:
+) -> Placements:
     """Where all views stand, from nothing but the photo and its labels.
 
     links: ((i, j, rotation of i onto j in the photo), ...) from matching: growth tries them beside
     its own guesses. Raises NoShape where no set of poses agrees with the silhouettes.
     """
     if len(views) == 1:
-        return SearchResult(first_pose(views[0], frame_scale(views))[None], np.ones(1), True)
+        return all_placed(first_pose(views[0], frame_scale(views))[None], np.ones(1), True)
     crops = instance_crops(views)
     best: Placed | None = None
     revolved = place_revolved(views, crops, o, seed=seed, say=say)
@@ -196,20 +179,22 @@ def place(
             parts=best.parts,
             say=say,
         )
-    return SearchResult(poses, without_torn(views, scores, torn, say), believed(best, o))
+    found = all_placed(poses, scores, believed(best, o))
+    deferred = deferred_until_the_end(views, torn, say)
+    found.status[deferred] = Status.CONTESTED
+    return found
 
 
-def without_torn(views: list[InstanceView], scores: np.ndarray, torn: set[int], say) -> np.ndarray:
-    """The scores (N,), TORN of those who agree better elsewhere with the others while all agree
-    less for it (`settled`): one in a wrong place has bent the others towards itself. Where these
-    few can be spared, their place is for the finished model of the others to say."""
-    if not torn or len(torn) > SPARED * len(views) or len(views) - len(torn) < ENOUGH:
-        return scores
-    labels = ", ".join(str(views[k].label) for k in sorted(torn))
-    say(
-        f"note: {labels} may stand wrong, as the model of the others says and that of all denies: left to the end"
-    )
-    return np.where(np.isin(np.arange(len(views)), list(torn)), TORN, scores)
+def deferred_until_the_end(views: list[InstanceView], contested: set[int], say) -> list[int]:
+    """Those of the `contested` instances (`settled`) whose pose is deferred until the final model of
+    the others: all of them where they can be spared, since one in a wrong place bends the others
+    towards itself; else none."""
+    count = len(views)
+    if not contested or len(contested) > SPARED * count or count - len(contested) < ENOUGH:
+        return []
+    labels = ", ".join(str(views[k].label) for k in sorted(contested))
+    say(f"note: the poses of {labels} are contested: deferred until the final model")
+    return sorted(contested)
 
 
 def up_to_turns(

@@ -15,6 +15,7 @@ from relit.fit.registration.instances.options import Search
 from relit.fit.registration.instances.rounds import model_of_all
 from relit.fit.registration.instances.search import place
 from relit.fit.registration.instances.views import InstanceView
+from relit.fit.registration.placements import Placements
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import turns_apart
 
@@ -24,13 +25,11 @@ SAME = 15.0  # degrees within which two searches have put all objects alike
 
 def place_few(
     views: list[InstanceView], o: Search, *, seed: int = 0, links=(), say=lambda text: None
-) -> tuple[np.ndarray, np.ndarray]:
-    """`place`, for few objects up to `o.searches` times: poses (N, 4, 4) and scores (N,). Raises
-    NoShape where every search does."""
+) -> Placements:
+    """`place`, for few objects up to `o.searches` times. Raises NoShape where every search does."""
     if not 2 < len(views) <= FEW or not o.descents or o.searches < 2:
-        one = place(views, o, seed=seed, links=links, say=say)
-        return one.poses, one.scores
-    found: list[tuple[float, np.ndarray, np.ndarray]] = []
+        return place(views, o, seed=seed, links=links, say=say)
+    found: list[tuple[float, Placements]] = []
     for trial in range(o.searches):
         try:
             one = place(views, o, seed=seed + 1000 * trial, links=links, say=say)
@@ -38,24 +37,23 @@ def place_few(
             if trial == o.searches - 1 and not found:
                 raise
             continue
-        poses, scores = one.poses, one.scores
         if one.sure:
-            return poses, scores
-        _, own = model_of_all(views, poses, o, seed=seed)
+            return one
+        _, own = model_of_all(views, one.poses, o, seed=seed)
         agreement = float(own.mean())
-        like = [other for other in found if turned_apart(poses, other[1]) < SAME]
-        found.append((agreement, poses, scores))
+        like = [other for other in found if turned_apart(one.poses, other[1].poses) < SAME]
+        found.append((agreement, one))
         say(
             f"search {trial + 1} of at most {o.searches}: agreement of all with a model of all {agreement:.3f}"
         )
         if like:
             say("two searches have come to the same poses")
-            return max([*like, found[-1]], key=lambda one: one[0])[1:]
-    agreement, poses, scores = max(found, key=lambda one: one[0])
+            return max([*like, found[-1]], key=lambda one: one[0])[1]
+    agreement, best = max(found, key=lambda one: one[0])
     say(
         f"note: no two of {o.searches} searches come to the same poses: the best is taken (agreement {agreement:.3f}); look at the result"
     )
-    return poses, scores
+    return best
 
 
 def turned_apart(a: np.ndarray, b: np.ndarray) -> float:

@@ -38,8 +38,16 @@ from relit.scene import Camera
 COARSE = 160  # pixels, longer side of a window while poses are searched
 MARGIN = 0.15  # of a window around its instance, of its size
 ACROSS = 50  # degrees from which another view bounds what this one leaves open in depth
-ANOTHER_PHOTO = 1 << 24  # labels are smaller: 24 bits of colour
 OBJECT_RADIUS = 0.8  # of the widest silhouette, in the unit frame
+
+
+@dataclass(frozen=True, order=True)
+class ViewId:
+    """Names the view of an instance among those of all photos. photo: its number, from 0. label: of
+    the instance in that photo's label image."""
+
+    photo: int
+    label: int
 
 
 @dataclass(frozen=True)
@@ -61,9 +69,8 @@ class InstanceView:
     photo: int = 0
 
     @property
-    def key(self) -> int:
-        """Names it among those of all photos; of the first photo it is the label."""
-        return self.label + self.photo * ANOTHER_PHOTO
+    def id(self) -> ViewId:
+        return ViewId(self.photo, self.label)
 
 
 def views_of(
