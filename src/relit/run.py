@@ -46,7 +46,7 @@ CHECKPOINT_LONGEST = 60.0  # ... but never later than this
 PREVIEW_SECONDS = 10.0  # between two previews of a stage
 METRICS_SECONDS = 0.5  # between two lines of metrics.jsonl
 FILES = ("config.toml", "inputs.json", "evaluation.json", "log.txt", "metrics.jsonl", "report.html")
-RUN_FORMAT = 2  # of the stages' results; a run folder of another format is refused
+RUN_FORMAT = 3  # of the stages' results; a run folder of another format is refused
 OWNED = (*FILES, "stages", "previews", "photos", "asset")
 
 

@@ -16,7 +16,7 @@ from relit.fit.flash.recipe import rates_by_step
 from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, FlashTerms, fit_flash_surface
 from relit.fit.passes.camera_corrections import CorrectionModel, no_corrections
 from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
-from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
+from relit.fit.passes.surface import EnvironmentTerms, TexelStart, fit_surface, start_surface
 from relit.fit.passes.volume import VolumeOptions, fit_volume, start_model
 from relit.fit.registration.instances.views import hold_distances, move_poses
 from relit.geometry.sdf import node_positions
@@ -114,7 +114,8 @@ def duplicates_surface(shot, stage):
     bank, _, mesh, _ = shot
     o = SurfaceOptions(**SURFACE, light=8, scale_power=1.0)
     known = np.ones((TEXELS, TEXELS), bool)
-    model = start_surface(np.full((TEXELS, TEXELS, 3), 0.3, np.float32), known, 0.3, o)
+    begun = TexelStart(np.full((TEXELS, TEXELS, 3), 0.3, np.float32), known, 0.3)
+    model = start_surface(begun, o)
     model.gaussians = GaussianLight(6, o.light, 0.3 / ALBEDO_START)
     fit_surface(EnvironmentTerms(bank, mesh, model, o), stage)
 

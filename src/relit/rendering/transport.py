@@ -49,7 +49,7 @@ class TraceableMesh:
     def __init__(self, mesh: Mesh, radiance: np.ndarray, blockers: Blockers | None = None):
         self.textured_faces, self.textured_vertices = len(mesh.faces), len(mesh.vertices)
         if blockers is not None:
-            mesh = joined(mesh, blockers.mesh)
+            mesh = textured_and_blockers(mesh, blockers.mesh)
             radiance = np.concatenate([radiance, blockers.radiance])
         self.mesh, self.scene = mesh, build_geometry(mesh)
         self.origins = SmoothOrigins(mesh)
@@ -64,7 +64,7 @@ class TraceableMesh:
         return np.arange(len(self.mesh.vertices)) >= self.textured_vertices
 
 
-def joined(one: Mesh, other: Mesh) -> Mesh:
+def textured_and_blockers(one: Mesh, other: Mesh) -> Mesh:
     """Both meshes, with normals and uvs, as one."""
     return Mesh(
         np.concatenate([one.vertices, other.vertices]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from relit.fit.flash.ambient import find_ambient
-from relit.fit.flash.features import FlashView, capture_features, flash_views_of
+from relit.fit.flash.features import FlashScene, FlashView, capture_features, flash_views_of
 from relit.fit.passes.pixels import batch_of, make_bank
 from relit.geometry.se3 import look_at
 from relit.lighting.flash import light_position
@@ -196,8 +196,9 @@ def test_first_colours_do_not_hold_the_bowl_s_own_light(scene, photos, ambient):
     rng = np.random.default_rng(1)
     n = rng.normal(size=(600, 3)) * [1, 0, 1] + [0, 1.5, 0]
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    without = capture_features(bank, views, traceable, -0.8 * n, n, coat, flash)
-    found = capture_features(bank, views, traceable, -0.8 * n, n, coat, flash, ambient)
+    shown = FlashScene(bank, views, traceable, coat, flash)
+    without = capture_features(shown, -0.8 * n, n)
+    found = capture_features(shown, -0.8 * n, n, ambient)
     assert found.seen.mean() > 0.95
     wrong, right = (np.median(f.albedo[f.seen] / DIFFUSE, axis=0) for f in (without, found))
     assert (
@@ -254,7 +255,11 @@ def test_a_flash_that_throws_no_shadow_throws_none_anywhere(scene):
         dark, bright = (
             np.array(
                 flash_views_of(
-                    bank, camera, 0, traceable, x, n, FlashView(offset, 1.0, shadow), lit_only
+                    FlashScene(bank, [camera], traceable, Coat(), FlashView(offset, 1.0, shadow)),
+                    0,
+                    x,
+                    n,
+                    lit_only,
                 ).ok
             )
             for shadow in (True, False)

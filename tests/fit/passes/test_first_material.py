@@ -180,7 +180,7 @@ def test_the_fit_that_tells_dull_paint_is_spared_where_nothing_asks_for_it(
 ):
     """It is made where dullness is asked for, and where it may stand against metal."""
     begun = []
-    monkeypatch.setattr(first, "start_surface", lambda *a: begun.append(a[3].roughness_start))
+    monkeypatch.setattr(first, "start_surface", lambda *a: begun.append(a[1].roughness_start))
     monkeypatch.setattr(first, "fit_surface", lambda *a: None)
     monkeypatch.setattr(first, "EnvironmentTerms", lambda *a: None)
     monkeypatch.setattr(
@@ -192,7 +192,7 @@ def test_the_fit_that_tells_dull_paint_is_spared_where_nothing_asks_for_it(
     )
     base, known = np.full((8, 8, 3), 0.5, np.float32), np.ones((8, 8), bool)
     start, roughness = first.first_material(
-        None, None, base, known, 1.0, None, SurfaceOptions(), dullness=dullness
+        None, None, first.TexelStart(base, known, 1.0, base if dullness else None), SurfaceOptions()
     )
     assert len(begun) == fits
     assert (start == (first.METAL if metallic > 0.5 else first.PAINT)).all() and (

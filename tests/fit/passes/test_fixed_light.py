@@ -43,9 +43,10 @@ def test_a_resting_light_costs_nothing(monkeypatch):
         [None] * 4,
     )
     known = np.ones((8, 8), bool)
-    model = surface.start_surface(
-        rng.uniform(0.2, 0.8, (8, 8, 3)), known, 0.4, OPTIONS, np.tile([0.0, 1.0, 0.0], (8, 8, 1))
+    begun = surface.TexelStart(
+        rng.uniform(0.2, 0.8, (8, 8, 3)), known, 0.4, np.tile([0.0, 1.0, 0.0], (8, 8, 1))
     )
+    model = surface.start_surface(begun, OPTIONS)
     for owner, name in (
         (surface, "parsimony"),
         (surface, "light_prior"),

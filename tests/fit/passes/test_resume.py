@@ -9,7 +9,7 @@ import pytest
 from relit.fit.passes.explore import explore
 from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
-from relit.fit.passes.surface import EnvironmentTerms, fit_surface, start_surface
+from relit.fit.passes.surface import EnvironmentTerms, TexelStart, fit_surface, start_surface
 from relit.fit.passes.volume import VolumeOptions, fit_volume
 from relit.rendering.background import start_background
 from support.small_passes import PASSES, SURFACE, TEXELS, VOLUME, ball_model
@@ -28,9 +28,9 @@ def multiview_surface(shot, stage):
     """With steps that paint and light trade."""
     bank, _, mesh, _ = shot
     o = SurfaceOptions(**SURFACE, light=8)
-    model = start_surface(
-        np.full((TEXELS, TEXELS, 3), 0.3, np.float32), np.ones((TEXELS, TEXELS), bool), 0.3, o
-    )
+    known = np.ones((TEXELS, TEXELS), bool)
+    begun = TexelStart(np.full((TEXELS, TEXELS, 3), 0.3, np.float32), known, 0.3)
+    model = start_surface(begun, o)
     fit_surface(EnvironmentTerms(bank, mesh, model, o), stage)
 
 

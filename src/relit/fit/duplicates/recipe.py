@@ -44,7 +44,13 @@ from relit.fit.duplicates.shape import FoundViews, shape_stages
 from relit.fit.duplicates.vessels import body_axis
 from relit.fit.passes.first_material import PAINT, first_material
 from relit.fit.passes.material_priors import ALBEDO_START
-from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.passes.surface import (
+    EnvironmentTerms,
+    SurfaceModel,
+    TexelStart,
+    fit_surface,
+    start_surface,
+)
 from relit.fit.registration.instances.views import InstanceView, ViewId
 from relit.fit.shape.mesh_stage import TexelMap, texels_of
 from relit.fit.shape.unseen import seen_faces
@@ -150,7 +156,7 @@ def surface_stage(
         alone = "visibility" in options.without
         lit = lit_pile(shots, camera, pile, options.max_pixels, alone=alone)
         texels = texels_of(pile.mesh, o.texture)
-        model = start_of_surface(lit, pile, texels, stage, fit)
+        model = pile_material_start(lit, pile, texels, stage, fit)
         gathered = None
         if "hidden" not in options.without and not lit.alone:
             hidden = hidden_from(lit.traced, lit.cameras)
@@ -176,30 +182,17 @@ def surface_stage(
     return fit.run.cached("surface", PileMaterial, computed, steps=o.steps, title=title)
 
 
-def start_of_surface(
+def pile_material_start(
     lit: LitPile, pile: PlacedPile, texels: TexelMap, stage, fit: FitContext
 ) -> SurfaceModel:
     """The material and light that the surface pass begins with."""
     run, options, o, known = fit.run, fit.options, pile_surface_options(fit.options), texels.known
-    start, metallic = texels.spread(pile.base), PAINT
+    begun, metallic = TexelStart(texels.spread(pile.base), known, lit.level), PAINT
     if "first_material" not in options.without and stage.load("checkpoint") is None:
-        # metal alone: each texel stands in many places under the light here, so that roughness
-        # finds its way from anywhere
         progress = run.progress("metal or paint")
-        metallic, _ = first_material(
-            lit.bank,
-            lit.traced,
-            start,
-            known,
-            lit.level,
-            None,
-            o,
-            fit.seed,
-            progress,
-            dullness=False,
-        )
+        metallic, _ = first_material(lit.bank, lit.traced, begun, o, fit.seed, progress)
         run.say(f"{(metallic[known] > 0.5).mean():.0%} of the surface begins as metal")
-    model = start_surface(start, known, lit.level, o, None, metallic)
+    model = start_surface(begun, o, metallic)
     if options.gaussians:
         level = max(lit.level, 1e-4) / ALBEDO_START
         model.gaussians = GaussianLight(options.gaussians, o.light, level)

@@ -220,7 +220,7 @@ def volume_stage(shots: list[Shot], found: FoundViews, fit: FitContext) -> PileS
     """Passes for the poses, and the volume pass from these. Instances that do not agree with their
     model are left out; they, and those that the search could not place, are then sought in the
     finished model."""
-    start = start_of_volume(shots, found, fit)
+    start = joint_passes(shots, found, fit)
     levels = fit.options.level_steps
     return fit.run.cached(
         "volume",
@@ -231,7 +231,7 @@ def volume_stage(shots: list[Shot], found: FoundViews, fit: FitContext) -> PileS
     )
 
 
-def start_of_volume(shots: list[Shot], found: FoundViews, fit: FitContext) -> PileStart:
+def joint_passes(shots: list[Shot], found: FoundViews, fit: FitContext) -> PileStart:
     """The passes for the poses, and the ends of a vessel."""
     run, options = fit.run, fit.options
     views, poses, others = found.views, found.poses, found.others

@@ -21,7 +21,13 @@ from relit.fit.passes.losses import dual_values
 from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import saturated_at
-from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.passes.surface import (
+    EnvironmentTerms,
+    SurfaceModel,
+    TexelStart,
+    fit_surface,
+    start_surface,
+)
 from relit.fit.passes.surface_loop import drawn_points
 from relit.fit.registration.instances.views import InstanceView
 from relit.geometry.atlas import unwrap
@@ -129,7 +135,8 @@ class TrialShape:
     def of(values: np.ndarray, lit: Callable[[Mesh], LitPile], o: SurfaceOptions) -> TrialShape:
         mesh, _ = unwrap(extract_mesh(redistance(values), faces=FACES), o.texture)
         pile, face = lit(mesh), rasterise_atlas(mesh, o.texture)[0]
-        model = start_surface(np.ones((*face.shape, 3), np.float32), face >= 0, pile.level, o)
+        even = TexelStart(np.ones((*face.shape, 3), np.float32), face >= 0, pile.level)
+        model = start_surface(even, o)
         return TrialShape(mesh, face, pile, model)
 
     def fit(self, o: SurfaceOptions, stage, seed: int) -> None:

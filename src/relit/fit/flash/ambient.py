@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from relit.fit.flash.features import ALPHA, FlashView, capture_features, flash_views_of
+from relit.fit.flash.features import ALPHA, FlashScene, FlashView, capture_features, flash_views_of
 from relit.fit.passes.pixels import PixelBank
 from relit.geometry.bake import fill_gutters
 from relit.geometry.sdf import node_positions
@@ -105,14 +105,13 @@ def find_ambient(
         coat.mean_transmittance(ALPHA),
         1 / ((1 - float(coat.internal(mi.Float(ALPHA))[0])) * coat.ior**2),
     )
+    scene = FlashScene(bank, cameras, traceable, coat, flash)
     straight = np.zeros((bank.views, len(x)))
     entering = np.zeros_like(straight)
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
     with dr.suspend_grad():
-        for view, camera in enumerate(cameras):
-            seen = flash_views_of(
-                bank, camera, view, traceable, point, normal, flash, lit_only=True
-            )
+        for view in range(bank.views):
+            seen = flash_views_of(scene, view, point, normal, lit_only=True)
             falls = dr.select(seen.ok, seen.cos_l * seen.inverse, 0)
             straight[view], entering[view] = (
                 np.array(falls),
@@ -121,7 +120,7 @@ def find_ambient(
     ambient = Ambient(tree, np.zeros((bank.views, len(x), 3), np.float32))
     _, blur = tree.query(tree.data, 8)
     for _ in range(ROUNDS):
-        found = capture_features(bank, cameras, traceable, x, n, coat, flash, ambient)
+        found = capture_features(scene, x, n, ambient)
         if found.seen.sum() < 0.1 * len(x):
             return ambient
         albedo = np.where(

@@ -50,6 +50,18 @@ class FlashView:
 
 
 @dataclass(frozen=True)
+class FlashScene:
+    """Photos under the flash, and the surface that they show. cameras: unit frame. mesh: in the unit
+    frame."""
+
+    bank: PixelBank
+    cameras: list[Camera]
+    mesh: TraceableMesh
+    coat: Coat
+    flash: FlashView
+
+
+@dataclass(frozen=True)
 class TexelEvidence:
     """albedo: (N, 3) diffuse, for the given intensity. seen: (N,) bool, enough photos. features:
     (N, 4) float32."""
@@ -60,17 +72,11 @@ class TexelEvidence:
 
 
 def capture_features(
-    bank: PixelBank,
-    cameras: list[Camera],
-    mesh: TraceableMesh,
-    x: np.ndarray,
-    n: np.ndarray,
-    coat: Coat,
-    flash: FlashView,
-    ambient: Any = None,
+    scene: FlashScene, x: np.ndarray, n: np.ndarray, ambient: Any = None
 ) -> TexelEvidence:
     """The features of N surface points x with normals n, both (N, 3), unit frame. ambient:
     fit.flash_ambient.Ambient, light from the surface itself, none where None."""
+    bank = scene.bank
     values = np.full((bank.views, len(x), 3), np.nan, np.float16)
     aside = np.zeros((bank.views, len(x)), bool)
     n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
@@ -78,13 +84,11 @@ def capture_features(
     dr.eval(point, normal)
     near = None if ambient is None else ambient.near(x, n)
     with dr.suspend_grad():
-        for view, camera in enumerate(cameras):
+        for view in range(bank.views):
             around = (
                 0.0 if near is None else (ambient.light[view][near[0]] * near[1][..., None]).sum(1)
             )
-            values[view], cosine = shading_free(
-                bank, camera, view, mesh, point, normal, coat, flash, around
-            )
+            values[view], cosine = shading_free(scene, view, point, normal, around)
             aside[view] = np.isfinite(values[view, :, 0]) & (cosine < SIDE)
     seen, enough = np.isfinite(values[..., 0]).sum(0) >= 3, aside.sum(0) >= 4
     albedo = np.full((len(x), 3), 0.5, np.float32)
@@ -115,17 +119,9 @@ class Seen:
     inverse: Any
 
 
-def flash_views_of(
-    bank: PixelBank,
-    camera: Camera,
-    view: int,
-    mesh: TraceableMesh,
-    x,
-    n,
-    flash: FlashView,
-    lit_only: bool = False,
-) -> Seen:
-    """x, n: Vector3f, unit frame. lit_only: whether `ok` asks for the flash alone."""
+def flash_views_of(scene: FlashScene, view: int, x, n, lit_only: bool = False) -> Seen:
+    """x, n: Vector3f, unit frame. lit_only: `ok` tells of the flash alone, not of the camera."""
+    bank, camera, flash = scene.bank, scene.cameras[view], scene.flash
     number = dr.opaque(mi.UInt32, view)
     eye = light_position(bank.cameras, number, mi.Vector3f(0))
     light = light_position(bank.cameras, number, mi.Vector3f(*[float(v) for v in flash.offset]))
@@ -152,27 +148,18 @@ def flash_views_of(
     for end in (*(() if lit_only else (eye,)), *((light,) if flash.shadow else ())):
         to = end - mi.Vector3f(start)
         length = dr.norm(to)
-        ok &= ~mesh.scene.ray_test(
+        ok &= ~scene.mesh.scene.ray_test(
             mi.Ray3f(start, to / length, length, 0.0, []), coherent=False, active=ok
         )
     return Seen(ok, column, row, cos_v, cos_l, inverse)
 
 
-def shading_free(
-    bank: PixelBank,
-    camera: Camera,
-    view: int,
-    mesh: TraceableMesh,
-    x,
-    n,
-    coat: Coat,
-    flash: FlashView,
-    around=0.0,
-):
+def shading_free(scene: FlashScene, view: int, x, n, around=0.0):
     """The photo's value at the points over what a white diffuse base would show there, (N, 3), NaN
     where the photo does not show them; and the cosine of the viewer's direction (N,). around: (N,
     3) irradiance from the surface itself over the flash's intensity, or 0."""
-    seen = flash_views_of(bank, camera, view, mesh, x, n, flash)
+    bank, camera, coat = scene.bank, scene.cameras[view], scene.coat
+    seen = flash_views_of(scene, view, x, n)
     ok, cos_v, cos_l = (
         seen.ok & (seen.cos_v > LEAST_COSINE) & (seen.cos_l > LEAST_COSINE),
         seen.cos_v,
@@ -195,26 +182,20 @@ def shading_free(
             ALPHA
         )
     base = base_radiance(mi.Color3f(1), coat, cos_v, alpha, enters)
-    out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * flash.intensity, 1e-6)
+    out = mi.Color3f(p.x, p.y, p.z) / dr.maximum(base * scene.flash.intensity, 1e-6)
     out = dr.select(ok, out, dr.nan)
     return np.array(out).T, np.array(cos_v)
 
 
 def network_features(
-    bank: PixelBank,
-    cameras: list[Camera],
-    mesh: TraceableMesh,
-    x: np.ndarray,
-    n: np.ndarray,
-    flash: FlashView,
-    network: DinoNetwork,
+    scene: FlashScene, x: np.ndarray, n: np.ndarray, network: DinoNetwork
 ) -> np.ndarray:
     """(N, 4) float32: the network's features on the points, for `Found.features`; 0 where no photo
     shows them."""
     n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
     dr.eval(point, normal)
-    offsets = np.array(bank.offsets)
+    bank, cameras, offsets = scene.bank, scene.cameras, np.array(scene.bank.offsets)
 
     def photo(view: int) -> np.ndarray:
         c = cameras[view]
@@ -224,7 +205,7 @@ def network_features(
         ]
 
     def places(view: int):
-        seen = flash_views_of(bank, cameras[view], view, mesh, point, normal, flash)
+        seen = flash_views_of(scene, view, point, normal)
         return (
             np.array(seen.column),
             np.array(seen.row),

@@ -29,7 +29,7 @@ from relit.capture.photo import layers
 from relit.errors import UserError
 from relit.fit.flash.ambient import find_ambient
 from relit.fit.flash.dino import DinoNetwork, network_file
-from relit.fit.flash.features import FlashView, capture_features, network_features
+from relit.fit.flash.features import FlashScene, FlashView, capture_features, network_features
 from relit.fit.flash.lobe_clusters import start_kinship
 from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, FlashTerms, fit_flash_surface
 from relit.fit.passes.held_out import score_held_out
@@ -242,7 +242,7 @@ def volume_stage(photos: UnitPhotos, capture: Capture, fit: FitContext) -> Volum
     mirrors = options.directions > 0 and "interreflection" not in options.without
 
     def computed(stage) -> VolumeResult:
-        model = start_of_volume(photos, stage, fit)
+        model = opened_hull(photos, stage, fit)
         begin_level = (lambda m: look_around(photos, m, coat, shadow)) if mirrors else None
         passes = VolumeOptions(options.levels, options.level_steps, options.rays)
         fit_volume(bank, model, passes, stage, fit.seed, begin_level)
@@ -266,7 +266,7 @@ def intensity_of(photos: UnitPhotos) -> float:
     return np.pi * distance2 * float(photos.level.mean()) / (START_ALBEDO * MEAN_COSINE)
 
 
-def start_of_volume(photos: UnitPhotos, stage, fit: FitContext) -> VolumeModel:
+def opened_hull(photos: UnitPhotos, stage, fit: FitContext) -> VolumeModel:
     """The visual hull, opened where the photos contradict it."""
     run, options = fit.run, fit.options
     try:
@@ -376,7 +376,7 @@ def surface_stage(photos: UnitPhotos, shaped: FlashMesh, fit: FitContext) -> Pla
 
     def computed(stage) -> PlasticMaps:
         texels = texels_of(shaped.mesh, fit.options.texture)
-        terms = start_of_surface(photos, shaped, texels, fit)
+        terms = flash_terms(photos, shaped, texels, fit)
         fit_flash_surface(terms, stage, fit.seed)
         model = terms.model
         maps = {name: texels.filled(t) for name, t in plastic_pictures(model.field).items()}
@@ -391,7 +391,7 @@ def surface_stage(photos: UnitPhotos, shaped: FlashMesh, fit: FitContext) -> Pla
     return run.cached("surface", PlasticMaps, computed, steps=o.steps, title=title)
 
 
-def start_of_surface(
+def flash_terms(
     photos: UnitPhotos, shaped: FlashMesh, texels: TexelMap, fit: FitContext
 ) -> FlashTerms:
     """Plastic and flash that the surface pass begins with: diffuse albedos from the photos, one
@@ -405,7 +405,8 @@ def start_of_surface(
     ambient = None
     if o.directions > 0:
         ambient = find_ambient(bank, cameras, mesh, coat, flash, BRIGHTEST)
-    found = capture_features(bank, cameras, traceable, x, n, coat, flash, ambient)
+    scene = FlashScene(bank, cameras, traceable, coat, flash)
+    found = capture_features(scene, x, n, ambient)
     diffuse = texels.spread(shaped.albedo[:, :3])
     diffuse[known] = np.where(found.seen[:, None], found.albedo, diffuse[known])
     scale = BRIGHTEST / max(float(np.percentile(diffuse[known].max(1), 99)), 1e-6)
@@ -416,7 +417,7 @@ def start_of_surface(
     features[known] = found.features
     if options.dino:
         network = DinoNetwork(network_file(options.dino))
-        features[known] = network_features(bank, cameras, traceable, x, n, flash, network)
+        features[known] = network_features(scene, x, n, network)
     features = texels.filled(features)
     kinship = None
     if "features" not in options.without:

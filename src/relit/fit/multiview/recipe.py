@@ -30,7 +30,13 @@ from relit.fit.passes.held_out import score_held_out
 from relit.fit.passes.load_photos import UnitPhotos, load_pixels
 from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.pixels import PixelBank, place_cameras
-from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.passes.surface import (
+    EnvironmentTerms,
+    SurfaceModel,
+    TexelStart,
+    fit_surface,
+    start_surface,
+)
 from relit.fit.passes.volume import (
     Mend,
     VolumeModel,
@@ -357,7 +363,7 @@ def surface_stage(
 
     def computed(stage) -> LitMaterial:
         texels = texels_of(shaped.mesh, o.texture)
-        model, traced = start_of_surface(bank, shaped, texels, stage, fit)
+        model, traced = surface_start(bank, shaped, texels, stage, fit)
         fit_surface(EnvironmentTerms(bank, traced, model, o, fit.seed), stage)
         names = ("base_color", "roughness", "metallic")
         paint = dict(zip(names, pictures(model.material), strict=True))
@@ -372,7 +378,7 @@ def surface_stage(
     return fit.run.cached("surface", LitMaterial, computed, steps=o.steps, title=title)
 
 
-def start_of_surface(
+def surface_start(
     bank: PixelBank, shaped: RadiantMesh, texels: TexelMap, stage, fit: FitContext
 ) -> tuple[SurfaceModel, TraceableMesh]:
     """The material and light that the surface pass begins with, and the mesh that rays are traced
@@ -382,17 +388,15 @@ def start_of_surface(
     known, areas = texels.known, vertex_areas(mesh)
     start = texels.spread(base_without_shading(radiance, mesh.normals, areas))
     mean = float((radiance * areas[:, None]).sum() / areas.sum() / 3)
-    normals = texels.spread(mesh.normals)
+    begun = TexelStart(start, known, mean, texels.spread(mesh.normals))
     reflecting = radiance * (0.0 if "interreflection" in options.without else 1.0)
     traced = TraceableMesh(mesh, reflecting)
     metallic, roughness = PAINT, None
     if "first_material" not in options.without and stage.load("checkpoint") is None:
         progress = run.progress("metal or paint")
-        metallic, roughness = first_material(
-            bank, traced, start, known, mean, normals, o, fit.seed, progress
-        )
+        metallic, roughness = first_material(bank, traced, begun, o, fit.seed, progress)
         run.say(describe(metallic, roughness, known))
-    return start_surface(start, known, mean, o, normals, metallic, roughness), traced
+    return start_surface(begun, o, metallic, roughness), traced
 
 
 def assemble(

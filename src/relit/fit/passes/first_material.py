@@ -24,7 +24,7 @@ from relit.fit.passes.losses import dual_values
 from relit.fit.passes.material_priors import SurfaceOptions
 from relit.fit.passes.optimiser import NoStage
 from relit.fit.passes.pixels import PixelBank, saturated_at
-from relit.fit.passes.surface import EnvironmentTerms, SurfaceModel, fit_surface, start_surface
+from relit.fit.passes.surface import EnvironmentTerms, TexelStart, fit_surface, start_surface
 from relit.fit.passes.surface_loop import drawn_points
 from relit.materials.field import material_at
 from relit.rendering.transport import TraceableMesh, reflected, sample_lights
@@ -64,20 +64,16 @@ BATCHES = 8  # of pixels that the fits are judged by
 def first_material(
     bank: PixelBank,
     mesh: TraceableMesh,
-    base: np.ndarray,
-    known: np.ndarray,
-    radiance: float,
-    normals,
+    texels: TexelStart,
     options: SurfaceOptions,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
-    dullness: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Metallic and roughness to begin with, (S, S) float32 each. base, known, radiance, normals: as
-    of `start_surface`.
-    progress: told how many steps of all short fits are over. dullness: False where the roughness is
-    not asked for; it is the usual one then wherever nothing may be metal, as the fit that tells
-    dull paint is spared."""
+    """Metallic and roughness to begin with, (S, S) float32 each. progress: called with how many
+    steps of all short fits are over. Texels without normals of their own stand in many places under
+    the light, so that roughness finds its way from anywhere: where none of them may be metal, the
+    fit that tells dull paint is spared."""
+    base, known, normals = texels.base, texels.known, texels.normals
     stage = NoStage(progress)
     o = replace(
         options,
@@ -96,19 +92,17 @@ def first_material(
     def errors_from(side: tuple[float, float | None]) -> np.ndarray:
         metallic, roughness = side
         first = o if roughness is None else replace(o, roughness_start=roughness)
-        model = start_surface(
-            small[0],
-            small[1] > 0.5,
-            radiance,
-            first,
-            None if normals is None else small[2],
-            metallic,
+        coarse = TexelStart(
+            small[0], small[1] > 0.5, texels.radiance, None if normals is None else small[2]
         )
-        fit_surface(EnvironmentTerms(bank, mesh, model, fewer_points(o), seed), stage)
-        return errors(bank, mesh, model, o, centres, colour, seed)
+        terms = EnvironmentTerms(
+            bank, mesh, start_surface(coarse, first, metallic), fewer_points(o), seed
+        )
+        fit_surface(terms, stage)
+        return errors(terms, o, centres, colour, seed)
 
     paint, metal = errors_from(SIDES[0]), errors_from(SIDES[1])
-    if not dullness and not may_be_metal(paint, metal).any():
+    if normals is None and not may_be_metal(paint, metal).any():
         return np.full(known.shape, PAINT, np.float32), np.full(
             known.shape, options.roughness_start, np.float32
         )
@@ -143,17 +137,10 @@ def groups_of(colour: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.nda
     return centres, vq(colour.reshape(-1, 3), centres)[0].reshape(known.shape)
 
 
-def errors(
-    bank: PixelBank,
-    mesh: TraceableMesh,
-    model: SurfaceModel,
-    o: SurfaceOptions,
-    centres,
-    colour,
-    seed: int,
-) -> np.ndarray:
+def errors(terms: EnvironmentTerms, o: SurfaceOptions, centres, colour, seed: int) -> np.ndarray:
     """(G, 3), for each group: the error of display values and the metallic, both summed over drawn
     pixels, and the pixels counted."""
+    bank, mesh, model = terms.bank, terms.mesh, terms.model
     size, groups = colour.shape[0], len(centres)
     rng = mi.PCG32(size=o.points, initstate=seed * 7919 + 29)
     out = np.zeros((groups, 3))

@@ -66,24 +66,27 @@ class SurfaceModel:
     gaussians: GaussianLight | None = None
 
 
-def start_surface(
-    base: np.ndarray,
-    known: np.ndarray,
-    radiance: float,
-    options: SurfaceOptions,
-    normals=None,
-    metallic=0.1,
-    roughness=None,
-) -> SurfaceModel:
-    """base: (S, S, 3) first guess of the base colour up to scale (materials.intrinsic), known: (S,
-    S) bool, radiance: mean over the object,
-    normals: (S, S, 3) of the texels, None where they stand in many places. metallic, roughness
-    (None: roughness_start): a number or (S, S).
+@dataclass(frozen=True)
+class TexelStart:
+    """What is known of the texels before the surface pass. base: (S, S, 3) first guess of the base
+    colour up to scale (materials.intrinsic). known: (S, S) bool, texels on the surface. radiance:
+    mean over the object. normals: (S, S, 3) unit, None where texels stand in many places."""
 
-    The light starts grey and even, bright enough that the mean base colour is ALBEDO_START.
+    base: np.ndarray
+    known: np.ndarray
+    radiance: float
+    normals: np.ndarray | None = None
+
+
+def start_surface(
+    texels: TexelStart, options: SurfaceOptions, metallic=0.1, roughness=None
+) -> SurfaceModel:
+    """metallic, roughness (None: roughness_start): a number or (S, S). The light starts grey and
+    even, bright enough that the mean base colour is ALBEDO_START.
     """
-    mean = float(base[known].mean())
-    albedo = np.clip(base * (ALBEDO_START / max(mean, 1e-6)), 0.02, 0.95)
+    radiance = texels.radiance
+    mean = float(texels.base[texels.known].mean())
+    albedo = np.clip(texels.base * (ALBEDO_START / max(mean, 1e-6)), 0.02, 0.95)
     rough = options.roughness_start if roughness is None else roughness
     material = start_material(options.texture, albedo, rough, metallic)
     h = options.light
@@ -93,7 +96,7 @@ def start_surface(
     metal = dr.select(material.metallic > 0.5, mi.Float(1), 0)
     dr.eval(metal)
     return SurfaceModel(
-        material, log_light, Environment(dr.exp(log_light), h, 2 * h), metal, normals
+        material, log_light, Environment(dr.exp(log_light), h, 2 * h), metal, texels.normals
     )
 
 
