@@ -38,7 +38,10 @@ from relit.masks.segment import segmenter
 from relit.masks.threshold import Backdrop, find_backdrop
 from relit.scene import Capture, Photo, Sphere
 
-READERS = {  # in this order; the first that recognises the folder reads it
+# In this order; the first that recognises the folder reads it. A reader has LOOKED_FOR, recognise(path)
+# and read(path, found) -> Reading; that of labelled photos gives its Source.
+READERS = {
+    "duplicates": sfd,
     "transforms": transforms_json,
     "iron": iron,
     "idr": idr,
@@ -71,7 +74,7 @@ def open_capture(
     'threshold', 'grabcut', 'segment' ask for one kind, and 'segment:NAME' for a network of rembg's
     other than its U^2-Net.
     max_side: photos are resized to at most so many pixels. min_photos: fewer photos are an error.
-    focal: pixels, of a photo of duplicates.
+    focal: pixels, of a photo of duplicates. labels: False reads labelled photos like any others.
     Raises UserError (exit code 3) for everything that is wrong with the input.
     """
     path = Path(path).expanduser()
@@ -84,10 +87,9 @@ def open_capture(
     check_max_side(max_side)
     if not path.exists():
         raise UserError("the input is not there", fix=f"check the path: {path}")
-    duplicates = sfd.recognise(path) if labels else None
-    if duplicates is not None:
-        return sfd.open_duplicates(duplicates, focal=focal, max_side=max_side)
-    reading = _read(path)
+    reading = _read(path, labels)
+    if isinstance(reading, sfd.Source):
+        return sfd.open_duplicates(reading, focal=focal, max_side=max_side)
     headers = photo.headers_of(reading.frames)
     notes = list(reading.notes) + _size_notes(reading, headers)
     training = sum(not f.held_out for f in reading.frames)
@@ -214,9 +216,12 @@ def with_calibration(p: Photo, frame: Frame) -> Photo:
     return p if frame.camera is None else photo.with_camera(p, frame.camera, frame.lens)
 
 
-def _read(path: Path) -> Reading:
-    """The reading of the first format that recognises `path`."""
-    for module in READERS.values():
+def _read(path: Path, labels: bool) -> Reading | sfd.Source:
+    """The reading of the first format that recognises `path`. labels: whether labelled photos are
+    taken for photos of duplicates."""
+    for name, module in READERS.items():
+        if name == "duplicates" and not labels:
+            continue
         found = module.recognise(path)
         if found is not None:
             return module.read(path, found)

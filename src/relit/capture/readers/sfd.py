@@ -42,6 +42,7 @@ from relit.errors import UserError
 from relit.images import EXTENSIONS, Header, read_header, read_image
 from relit.scene import Camera, Capture, Photo, Pixels
 
+LOOKED_FOR = "a photo with NAME_labels.png, cut-outs, COCO or BOP labels beside it (SfD)"
 SUFFIXES = ("_instance_seg", "_labels", "_instances", "_seg")
 SFD_NORMALS = "_normal_pretrain.png"  # SfD's: y up, z towards the camera
 CUTOUTS = ("cutouts", "cut-outs", "instances")
@@ -102,6 +103,12 @@ def recognise(path: Path) -> Source | None:
             if found:
                 return _source(path, found, _cameras(path))
     return None
+
+
+def read(path: Path, found: Source) -> Source:
+    """Labelled photos need the focal length and the size that the user asks for: `open_duplicates`
+    reads them."""
+    return found
 
 
 def _source(root: Path, found: list[tuple[Path, Path]], cameras: Path | None) -> Source:
