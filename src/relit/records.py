@@ -50,7 +50,7 @@ def _put(out: dict[str, np.ndarray], key: str, value: Any) -> None:
     elif isinstance(value, enum.Enum):
         out[key] = np.array(value.name)
     else:
-        array = np.asarray(value)
+        array = np.array(value, order="C", copy=None)  # sums over other orders round otherwise
         if array.dtype.hasobject:
             raise TypeError(f"{key}: {type(value).__name__} is neither array, number nor text")
         out[key] = array

@@ -202,9 +202,9 @@ class Run:
         """
         if not self.done(name):
             with self.stage(name, steps=steps, title=title) as stage:
-                result = compute(stage)
-                stage.save("result", **to_arrays(result))
-            return result
+                arrays = to_arrays(compute(stage))
+                stage.save("result", **arrays)
+            return from_arrays(kind, arrays)  # as a resumed run reads it
         try:
             return from_arrays(kind, run_arrays(self, name, "result"))
         except (LookupError, ValueError, TypeError) as error:

@@ -88,7 +88,8 @@ def no_corrections(
     views: int, model: CorrectionModel = CorrectionModel.ABOUT_CAMERA
 ) -> CameraCorrections:
     """Corrections of `views` cameras that change nothing."""
-    return CameraCorrections(model, dr.zeros(mi.Float, model.value * views))
+    # in memory, not literal zeros: the first step runs the kernels of all others
+    return CameraCorrections(model, dr.opaque(mi.Float, 0.0, model.value * views))
 
 
 def corrected(cameras: list[Camera], corrections: CameraCorrections) -> list[Camera]:

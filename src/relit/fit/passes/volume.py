@@ -357,6 +357,7 @@ def _fit_level(bank, model, options, stage, camera_adam, *, first, begin, end, m
             )
             free = CameraCorrections(bank.corrections.model, moved)
             bank.corrections = free if held else without_common_motion(free, bank.cameras)
+            dr.schedule(bank.corrections.values)  # a checkpoint then changes no rounding
         dr.eval(grid.row_values)
         write_rows(grid)
         return report
