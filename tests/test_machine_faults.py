@@ -173,7 +173,7 @@ def test_what_a_finished_stage_has_kept_was_damaged(capsys, capture, finished, t
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     shutil.rmtree(run / "asset")
-    path = run / "stages/mesh/mesh.npz"
+    path = run / "stages/mesh/result.npz"
     path.write_bytes(path.read_bytes()[:-40])
     code, _, err = relit(capsys, "reconstruct", capture, "-o", run, *WORDS)
     answered(code, err, 3, "stage 'mesh'")

@@ -126,17 +126,12 @@ def test_editing_keeps_both_together(tmp_path, plastic):
 def test_the_recipe_fills_both(plastic, tmp_path):
     from pathlib import Path
 
-    from relit.fit.flash.recipe import assemble
+    from relit.fit.flash.recipe import PlasticMaps, assemble
     from relit.scene import Capture, Photo, Sphere
 
     m = plastic.material
-    maps = {
-        "diffuse": m.diffuse,
-        "specular": m.specular,
-        "alpha": m.roughness**2,
-        "normal": m.normal,
-    }
-    maps |= {"offset": np.zeros(3), "intensity": np.ones(1)}
+    alpha = m.roughness**2
+    maps = PlasticMaps(m.diffuse, m.specular, alpha, m.normal, np.zeros(3), np.ones(1))
     photo = Photo("a.png", None, 48, 48, plastic.cameras[0][1])
     capture = Capture(Path("."), "test", (photo,), sphere=Sphere(np.zeros(3), 1.0))
     made = assemble(capture, plastic.mesh, maps, 1.49)

@@ -11,6 +11,7 @@ import pytest
 from relit.capture.photo import with_camera
 from relit.errors import UserError
 from relit.fit.flash import recipe as flash
+from relit.fit.passes.load_photos import UnitPhotos
 from relit.fit.passes.pixels import make_bank
 from relit.masks.threshold import Backdrop
 from relit.rendering.appearance.flash_light import start_learnt
@@ -18,17 +19,18 @@ from relit.scene import Capture, Photo, Sphere
 from support import flash_ball as scene
 
 
-def bank_of(views, value, mask=1.0):
-    size = views[0].width
-    images = [np.full((size, size, 3), value, np.float32)] * len(views)
-    masks = [np.full((size, size), mask, np.float32)] * len(views)
-    return make_bank(views, images, masks), masks
+def photos_of(views, value):
+    """Photos of one brightness, all object."""
+    size, count = views[0].width, len(views)
+    masks = [np.ones((size, size), np.float32)] * count
+    bank = make_bank(views, [np.full((size, size, 3), value, np.float32)] * count, masks)
+    return UnitPhotos(bank, views, masks, np.full(3, value), [f"{k}.png" for k in range(count)])
 
 
 def test_photos_of_a_lit_room_are_refused(device):
-    bank, _ = bank_of(scene.cameras(4, 16), 0.3)
+    photos = photos_of(scene.cameras(4, 16), 0.3)
     with pytest.raises(UserError, match="surroundings are not dark"):
-        flash.check_photos(bank, scene.cameras(4, 16), None, np.full(3, 0.3))
+        flash.check_photos(replace(photos, masks=None))
 
 
 def test_photos_before_a_bright_backdrop_are_refused():
@@ -61,34 +63,34 @@ def test_a_bright_backdrop_is_noticed_behind_a_lens_too():
 
 def test_a_flash_that_did_not_fire(device):
     views = scene.cameras(4, 16)
-    bank, masks = bank_of(views, 0.001)
+    photos = photos_of(views, 0.001)
     with pytest.raises(UserError, match="black") as error:
-        flash.check_photos(bank, views, masks, np.full(3, 0.001))
+        flash.check_photos(photos)
     assert "did not fire" in error.value.why
     with pytest.raises(
         UserError, match="photos are black"
     ):  # no backdrop is found in them either: that is not their fault
-        flash.check_photos(bank, views, None, np.full(3, 0.001))
+        flash.check_photos(replace(photos, masks=None))
 
 
 def test_over_exposed_photos(device):
     views = scene.cameras(4, 16)
-    bank, masks = bank_of(views, 1.0)
+    photos = photos_of(views, 1.0)
     with pytest.raises(UserError, match="100 % of the object's pixels are over-exposed"):
-        flash.check_photos(bank, views, masks, np.ones(3))
+        flash.check_photos(photos)
 
 
 def test_cameras_at_one_spot(device):
     views = [scene.cameras(4, 16)[0]] * 4
-    bank, masks = bank_of(views, 0.3)
+    photos = photos_of(views, 0.3)
     with pytest.raises(UserError, match="from one place"):
-        flash.check_photos(bank, views, masks, np.full(3, 0.3))
+        flash.check_photos(photos)
 
 
 def test_good_photos_pass(device):
     views = scene.cameras(6, 16)
-    bank, masks = bank_of(views, 0.3)
-    flash.check_photos(bank, views, masks, np.full(3, 0.3))
+    photos = photos_of(views, 0.3)
+    flash.check_photos(photos)
 
 
 def test_options():
@@ -135,8 +137,10 @@ def test_the_asset_stands_in_the_frame_of_the_cameras():
     one = np.ones((4, 4), np.float32)
     normal = np.zeros((4, 4, 3), np.float32)
     normal[..., 2] = 1
-    maps = {"diffuse": normal + 0.2, "specular": 0.5 * one, "alpha": 0.09 * one, "normal": normal}
-    maps |= {"offset": np.array([0.1, -0.05, 0]), "intensity": np.array([3.0])}
+    offset = np.array([0.1, -0.05, 0])
+    maps = flash.PlasticMaps(
+        normal + 0.2, 0.5 * one, 0.09 * one, normal, offset, intensity=np.array([3.0])
+    )
     asset = flash.assemble(capture, scene.ball(6, 8), maps, 1.49)
     np.testing.assert_allclose(asset.flash.offset, [0.2, -0.1, 0])
     np.testing.assert_allclose(asset.flash.intensity, 12)

@@ -61,7 +61,8 @@ def test_a_rough_start_descends(photos):
 def test_only_the_lost_photo_moves(model, photos):
     from relit.fit.collection.held_out import look_again
     from relit.fit.collection.options import CollectionOptions
-    from relit.fit.collection.photos import CollectionPhoto
+    from relit.fit.collection.photos import CollectionPhoto, PhotoSet
+    from relit.recipe import FitContext
 
     some = photos[:4]
     plain = [replace(c, world_from_camera=np.eye(4)) for *_, c in some]
@@ -72,13 +73,15 @@ def test_only_the_lost_photo_moves(model, photos):
     cameras = [c for *_, c in some]
     cameras[2] = cameras[2].with_pose(cameras[0].world_from_camera)
     options = CollectionOptions(keep=2, frozen_steps=20, rays=2048, refine_cameras=0.001)
-    seen = look_again(shots, cameras, model, 45.0, np.zeros(len(shots), bool), options, 0)
+    shape = SimpleNamespace(cameras=cameras, model=model)
+    fit = FitContext(None, options, 0)
+    seen = look_again(shape, PhotoSet(shots, [], 45.0), np.zeros(len(shots), bool), fit)
     assert (
-        seen.moved == [2]
+        seen.moved.tolist() == [2]
         and seen.detail.shape == seen.as_well.shape == (4,)
         and (np.abs(seen.detail) <= 1).all()
     )
-    assert errors(np.array([c.world_from_camera for c in seen.cameras]), some).max() < 6.0
+    assert errors(seen.poses, some).max() < 6.0
 
 
 def test_ablation_without_search_keeps_the_hints(photos):
