@@ -156,7 +156,7 @@ def test_wrong_input_is_answered(ball, tmp_path):
     for wrong in [
         dict(views=1),
         dict(spp=0),
-        dict(truth_bsdf="phong"),
+        dict(renderer="phong"),
         dict(roughness=1.5),
         dict(relights=[light, light]),
     ]:

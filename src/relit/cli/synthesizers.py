@@ -58,6 +58,8 @@ def sampling_flags(
 
 
 def multiview_flags(parser: Parser) -> None:
+    from relit.synthesize.renderers import RENDERERS
+
     add = parser.common.add_argument
     add(
         "--light",
@@ -74,6 +76,13 @@ def multiview_flags(parser: Parser) -> None:
         default=[],
         metavar="FILE",
         help="lights of the relighting ground truth",
+    )
+    add(
+        "--renderer",
+        choices=RENDERERS,
+        default="relit",
+        help="renderer of the ground truth: relit (the BRDF of fits), mitsuba (its principled "
+        "BSDF) or cycles (Blender; extra 'cycles') (default relit)",
     )
     sampling_flags(parser, views=60, test_views=12, resolution=400, spp=64, test_spp=256)
 
@@ -101,6 +110,7 @@ def multiview(args) -> None:
         spp=args.spp,
         test_spp=args.test_spp,
         seed=args.seed,
+        renderer=args.renderer,
         roughness=args.roughness,
         metallic=args.metallic,
         say=Log().say,

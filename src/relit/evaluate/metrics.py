@@ -18,9 +18,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from relit.conventions import environment_solid_angles, srgb_from_linear
+from relit.conventions import environment_solid_angles
+from relit.images.fidelity import MASK as MASK
+from relit.images.fidelity import encode as encode
+from relit.images.fidelity import psnr as psnr
 
-MASK = 0.99  # truth coverage from which a pixel counts as inside: rims mix object and background
 SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # an 11 x 11 window, as Wang et al. 2004 and PIR
 
 DEFINITIONS = {
@@ -33,25 +35,6 @@ DEFINITIONS = {
     "a pixel without a prediction counts 90",
     "mse": f"mean squared error over pixels with truth coverage >= {MASK}; a pixel without a prediction counts as value 0",
 }
-
-
-def encode(linear):
-    """Linear -> sRGB clipped to [0, 1], what every picture figure is taken on."""
-    return srgb_from_linear(np.clip(linear, 0.0, 1.0))
-
-
-def psnr(a, b, where=None, peak: float = 1.0) -> float:
-    """Peak signal-to-noise ratio in dB of two arrays in the space they are given in.
-
-    where: (H, W) bool, the pixels that count, or None for all. Equal arrays give 100, the largest
-    figure returned; no pixel at all gives nan.
-    """
-    error = np.square(np.asarray(a, np.float64) - np.asarray(b, np.float64))
-    if where is not None:
-        error = error[np.asarray(where, bool)]
-    if error.size == 0:
-        return float("nan")
-    return float(min(100.0, 10 * np.log10(peak**2 / max(error.mean(), 1e-12))))
 
 
 def ssim_map(a, b) -> np.ndarray:

@@ -18,6 +18,7 @@ import numpy as np
 
 from relit.conventions import move_points, scale_of
 from relit.errors import UserError
+from relit.geometry.tangents import vertex_tangents
 from relit.lighting.flash import flash_position
 from relit.materials import rough_plastic
 from relit.reference.bsdf import shading_normal
@@ -165,7 +166,9 @@ def build_flash_scene(mesh: Mesh, material: Material, world_from_asset=None) -> 
     scene = mi.load_dict(
         {
             "type": "scene",
-            "object": mitsuba_mesh(unit, mi.load_dict(d), t["normalmap"] is not None),
+            "object": mitsuba_mesh(
+                unit, mi.load_dict(d), None if t["normalmap"] is None else vertex_tangents(unit)
+            ),
             "light": light,
         }
     )

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from relit.conventions import move_points, move_pose, scale_of, similarity
+from relit.conventions import f0_from_ior, move_points, move_pose, scale_of, similarity
 from relit.errors import UserError
 from relit.geometry.tangents import vertex_normals, vertex_tangents
 from relit.reference import bsdf as relit_bsdf
@@ -99,8 +99,9 @@ def moved_mesh(mesh: Mesh, unit_from_asset) -> Mesh:
     )
 
 
-def mitsuba_mesh(mesh: Mesh, bsdf, with_tangents: bool):
-    """Mitsuba's mesh of a mesh with normals. with_tangents: as attributes, for normal maps."""
+def mitsuba_mesh(mesh: Mesh, bsdf, tangents: np.ndarray | None = None):
+    """Mitsuba's mesh of a mesh with normals. tangents: (V, 4) of `vertex_tangents`, which become
+    attributes for normal maps."""
     props = mi.Properties()
     props["mesh_bsdf"] = bsdf
     out = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), props, True, mesh.uvs is not None)
@@ -111,10 +112,9 @@ def mitsuba_mesh(mesh: Mesh, bsdf, with_tangents: bool):
         p["vertex_texcoords"] = mi.Float(np.asarray(mesh.uvs, np.float32).ravel())
     p["faces"] = mi.UInt32(np.asarray(mesh.faces, np.uint32).ravel())
     p.update()
-    if with_tangents:
-        t = vertex_tangents(mesh)
-        out.add_attribute("vertex_tangent", 3, np.ascontiguousarray(t[:, :3]).ravel())
-        out.add_attribute("vertex_handedness", 1, np.ascontiguousarray(t[:, 3]))
+    if tangents is not None:
+        out.add_attribute("vertex_tangent", 3, np.ascontiguousarray(tangents[:, :3]).ravel())
+        out.add_attribute("vertex_handedness", 1, np.ascontiguousarray(tangents[:, 3]))
     return out
 
 
@@ -149,29 +149,21 @@ def build_scene(
         if material.normal is None
         else mitsuba_texture(np.asarray(material.normal, np.float32) * 0.5 + 0.5),
     }
-    if bsdf == "relit":
-        d = {
-            "type": relit_bsdf.register_bsdf(),
-            "int_ior": float(material.ior),
-            **{k: v for k, v in t.items() if v is not None},
-        }
-    else:
-        if material.specular is not None:
-            raise UserError(
-                "Mitsuba's principled BSDF takes no specular map", fix="use bsdf='relit'"
-            )
-        d = {
-            "type": "principled",
-            "eta": float(material.ior),
-            **{k: t[k] for k in ("base_color", "roughness", "metallic")},
-        }
-        if t["normalmap"] is not None:
-            d = {"type": "normalmap", "normalmap": t["normalmap"], "bsdf": d}
-        d = {"type": "twosided", "bsdf": d}
     unit_from_world = unit_ball(mesh, world_from_asset)
     unit = moved_mesh(mesh, unit_from_world @ world_from_asset)
-    shape = mitsuba_mesh(unit, mi.load_dict(d), t["normalmap"] is not None)
-    scene = {"type": "scene", "object": shape}
+    tangents = None if t["normalmap"] is None else vertex_tangents(unit)
+    scene: dict[str, Any] = {"type": "scene"}
+    if bsdf == "relit":
+        own = {"type": relit_bsdf.register_bsdf(), "int_ior": float(material.ior)}
+        own |= {k: v for k, v in t.items() if v is not None}
+        scene["object"] = mitsuba_mesh(unit, mi.load_dict(own), tangents)
+    else:
+        mirrored = np.zeros(len(unit.faces), bool) if tangents is None else mirrored_faces(unit)
+        for name, chosen in (("object", ~mirrored), ("mirrored", mirrored)):
+            if chosen.any():
+                part = replace(unit, faces=np.ascontiguousarray(unit.faces[chosen]))
+                plugin = mi.load_dict(principled_plugin(material, t, name == "mirrored"))
+                scene[name] = mitsuba_mesh(part, plugin, tangents)
     if environment is not None:
         scene["environment"] = {
             "type": "envmap",
@@ -182,11 +174,54 @@ def build_scene(
     )
 
 
+def mirrored_faces(mesh: Mesh) -> np.ndarray:
+    """(F,) bool: faces whose texture is mirrored (a handedness of -1 in glTF)."""
+    v, uv = np.asarray(mesh.vertices, np.float64)[mesh.faces], np.asarray(mesh.uvs)[mesh.faces]
+    facet = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
+    side = np.sign((facet * np.asarray(mesh.normals)[mesh.faces].sum(1)).sum(-1))
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) * side > 0  # v points down in the texture
+
+
+def principled_plugin(material: Material, textures: dict, mirrored: bool) -> dict:
+    """Mitsuba's `principled` with the material's textures, as a dictionary for `load_dict`.
+
+    mirrored: for faces of `mirrored_faces`. Mitsuba's `normalmap` has no handedness (its bitangent
+    is cross(n, t)), so the second component of the map is negated there.
+    """
+    d = {
+        "type": "principled",
+        "eta": principled_eta(material),
+        **{k: textures[k] for k in ("base_color", "roughness", "metallic")},
+    }
+    if material.normal is not None:
+        normal = np.asarray(material.normal, np.float32) * (1, -1 if mirrored else 1, 1)
+        d = {"type": "normalmap", "normalmap": mitsuba_texture(normal * 0.5 + 0.5), "bsdf": d}
+    return {"type": "twosided", "bsdf": d}
+
+
+def principled_eta(material: Material) -> float:
+    """Index of refraction with the material's dielectric F0, a constant grey specular factor
+    included. Raises UserError for a specular texture or colour, which `principled` lacks."""
+    if material.specular is None:
+        return float(material.ior)
+    factor = np.asarray(material.specular)
+    if np.ptp(factor) > 1e-3:
+        raise UserError(
+            "Mitsuba's principled BSDF takes no specular texture or colour",
+            "the material has one",
+            "use the own renderer or cycles",
+            code=2,
+        )
+    root = np.sqrt(min(f0_from_ior(float(material.ior)) * float(factor.mean()), 0.9))
+    return float(max((1 + root) / (1 - root), 1.0001))
+
+
 def build_geometry(mesh: Mesh):
     """A Mitsuba scene of the mesh alone, in its own frame, for ray queries (no material, no
     light)."""
     return mi.load_dict(
-        {"type": "scene", "object": mitsuba_mesh(mesh, mi.load_dict({"type": "diffuse"}), False)}
+        {"type": "scene", "object": mitsuba_mesh(mesh, mi.load_dict({"type": "diffuse"}))}
     )
 
 

@@ -1,5 +1,5 @@
-"""Captures with known truth: photos of a GLB or OBJ under an HDRI, rendered by Mitsuba's path
-tracer.
+"""Captures with known truth: photos of a GLB or OBJ under an HDRI, by a renderer of choice
+(`synthesize.renderers`).
 
 The folder is a NeRF-synthetic capture (`transforms_{train,test}.json`, 8-bit sRGB RGBA with
 straight alpha) with the truth beside it:
@@ -20,8 +20,7 @@ straight alpha) with the truth beside it:
 World frame: the middle of the object's bounding box is the origin and its farthest vertex lies at
 RADIUS. Cameras look at the origin.
 
-Nothing but the benchmark, the demo and the command line imports this module: it alone of `capture`
-reaches up to `asset` and `rendering`.
+truth.json also has the renderer and the capture's ceiling (`synthesize.ceiling`).
 """
 
 from __future__ import annotations
@@ -40,6 +39,16 @@ from relit.errors import UserError
 from relit.files import write_text
 from relit.geometry.se3 import look_at
 from relit.scene import Camera, Material, Mesh
+from relit.synthesize.ceiling import ceilings
+from relit.synthesize.renderers import (
+    TrueObject,
+    TruthScene,
+    as_truth,
+    build_truth,
+    depth_of,
+    describe_renderer,
+    truth_picture,
+)
 
 VERSION = 1  # of the layout and of what is rendered; part of the settings' hash
 RADIUS = 0.8  # of the object's bounding sphere, world units
@@ -61,10 +70,10 @@ def synthesize_multiview(
     spp: int = 64,
     test_spp: int = 256,
     seed: int = 0,
-    truth_bsdf: str = "relit",
+    renderer: str = "relit",
     roughness: float | None = None,
     metallic: float | None = None,
-    max_depth: int = 6,
+    max_depth: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Path:
     """Render a multi-view capture of one object under one light, with its truth, into `out`;
@@ -73,7 +82,8 @@ def synthesize_multiview(
     asset_file: .glb, .gltf or .obj. light_file, relights: lat-long .hdr or .exr in Mitsuba's axes.
     spp, test_spp: samples a pixel of the training photos and of everything that is measured
     against. roughness, metallic: replace the file's maps by a constant (an OBJ has none).
-    truth_bsdf: 'relit' (the package's own metallic-roughness model) or 'principled' (Mitsuba's).
+    renderer: one of `synthesize.renderers.RENDERERS`. max_depth: longest path in edges (2 = direct
+    light only), None for what the renderer usually has.
 
     Deterministic by `seed`. A call with the same settings takes up where a killed one stopped and
     returns at once when all is there.
@@ -83,7 +93,10 @@ def synthesize_multiview(
     """
     asset_file, light_file, out = Path(asset_file), Path(light_file), Path(out)
     relights = [Path(r) for r in relights]
-    _check(relights, views, test_views, resolution, spp, test_spp, truth_bsdf, roughness, metallic)
+    max_depth = depth_of(renderer, max_depth)
+    _check_counts(views, test_views, resolution, spp, test_spp)
+    _check_material(roughness, metallic)
+    _check_names(relights)
     settings = settings_of(
         asset_file,
         light_file,
@@ -94,7 +107,7 @@ def synthesize_multiview(
         spp=spp,
         test_spp=test_spp,
         seed=seed,
-        truth_bsdf=truth_bsdf,
+        renderer=renderer,
         roughness=roughness,
         metallic=metallic,
         max_depth=max_depth,
@@ -104,26 +117,20 @@ def synthesize_multiview(
 
     from relit.asset.gltf import read_asset_file
     from relit.images import read_image, write_linear
-    from relit.reference.mitsuba_scene import build_scene
 
     mesh, material = read_asset_file(asset_file)
     material = overridden(material, roughness, metallic)
-    world_from_asset = object_frame(mesh)
+    thing = TrueObject(mesh, material, object_frame(mesh))
     train = orbit_cameras(views, resolution, seed=seed, prefix="train/r_")
     test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="test/t_")
     truth = out / "truth"
-    write_mesh(truth / "mesh.ply", mesh, world_from_asset)
+    write_mesh(truth / "mesh.ply", mesh, thing.world_from_asset)
     _write_transforms(out / "transforms_train.json", train, resolution)
     _write_transforms(out / "transforms_test.json", test, resolution)
 
-    def lit(file: Path):
+    def lit(file: Path) -> tuple[TruthScene, np.ndarray]:
         """Scene under a light whose exposure fits the object, and that light."""
-        environment = read_image(file).rgb
-        scene = build_scene(mesh, material, world_from_asset, environment, bsdf=truth_bsdf)
-        environment = (environment * exposure_factor(scene, train, max_depth)).astype(np.float32)
-        return build_scene(
-            mesh, material, world_from_asset, environment, bsdf=truth_bsdf
-        ), environment
+        return exposed(renderer, thing, read_image(file).rgb, train, max_depth)
 
     scene, environment = lit(light_file)
     write_linear(truth / "environment.exr", environment)
@@ -141,6 +148,8 @@ def synthesize_multiview(
             out, scene, name, camera, test_spp, max_depth, seed * 1_000_003 + 500_000 + i
         )
         tell_progress(say, "test view", i, test_views)
+    made_by = describe_renderer(renderer, scene)
+    scene.close()
     for j, file in enumerate(relights):
         scene, environment = lit(file)
         folder = truth / "relight" / file.stem
@@ -159,12 +168,22 @@ def synthesize_multiview(
                     ),
                 )
             tell_progress(say, f"test view under {file.stem}", i, test_views)
+        scene.close()
 
+    def pictures(folder: Path) -> list[tuple[Path, Camera]]:
+        return [(folder / f"{Path(name).name}.exr", camera) for name, camera in test]
+
+    relit = {file.stem: truth / "relight" / file.stem for file in relights}
+    lights = {"capture": (truth / "environment.exr", pictures(truth / "test"))} | {
+        name: (folder.with_suffix(".exr"), pictures(folder)) for name, folder in relit.items()
+    }
     write_json(
         truth / "truth.json",
         {
             "settings": settings,
-            "world_from_asset": world_from_asset.tolist(),
+            "renderer": made_by,
+            "ceiling": ceilings(thing, lights, test_spp, seed, say),
+            "world_from_asset": thing.world_from_asset.tolist(),
             "sphere": {"centre": [0.0, 0.0, 0.0], "radius": RADIUS},
             "ior": material.ior,
             "train": [name for name, _ in train],
@@ -229,10 +248,25 @@ def orbit_cameras(
 
 
 def radiance(scene, camera: Camera, spp: int, max_depth: int, seed: int) -> np.ndarray:
-    """(H, W, 4) float32 linear premultiplied radiance and coverage."""
-    from relit.reference.mitsuba_scene import render
+    """(H, W, 4) float32 linear premultiplied radiance and coverage. scene: a TruthScene, or one of
+    Mitsuba."""
+    return truth_picture(as_truth(scene), camera, spp, max_depth, seed)
 
-    return render(scene, camera, spp=spp, seed=seed, max_depth=max_depth)
+
+def exposed(
+    renderer: str,
+    thing: TrueObject,
+    environment: np.ndarray,
+    cameras: Sequence[tuple[str, Camera]],
+    max_depth: int,
+) -> tuple[TruthScene, np.ndarray]:
+    """The scene under a light whose exposure fits the object (`exposure_factor`), and that light."""
+    scene = build_truth(renderer, thing, environment, max_depth)
+    factor = exposure_factor(scene, cameras, max_depth)
+    lit = (environment * factor).astype(np.float32)
+    if scene.cycles is not None:
+        return scene.brighter(factor), lit
+    return build_truth(renderer, thing, lit, max_depth), lit
 
 
 def exposure_factor(scene, cameras: Sequence[tuple[str, Camera]], max_depth: int) -> float:
@@ -266,7 +300,7 @@ def write_training_view(
         from relit.images import write_linear
         from relit.reference.mitsuba_scene import render_channels
 
-        channels = render_channels(scene, camera, spp=16)
+        channels = render_channels(as_truth(scene).channels, camera, spp=16)
         write_linear(target, np.concatenate([channels["albedo"], channels["alpha"][..., None]], -1))
 
 
@@ -281,7 +315,7 @@ def write_test_view(
     picture, photo = stem.with_suffix(".exr"), out / f"{name}.png"
     if picture.exists() and photo.exists():
         return
-    channels = render_channels(scene, camera, spp=64)
+    channels = render_channels(as_truth(scene).channels, camera, spp=64)
     for key in ("albedo", "normal"):
         write_linear(
             stem.with_name(f"{stem.name}_{key}.exr"),
@@ -297,13 +331,20 @@ def write_test_view(
 # ---------------------------------------------------------------- files
 
 
-def _check(
-    relights, views, test_views, resolution, spp, test_spp, truth_bsdf, roughness, metallic
-) -> None:
+def _check_names(relights: Sequence[Path]) -> None:
     if len({f.stem for f in relights}) < len(relights):
         raise UserError(
             "two relighting files have one name", "the truth is kept by name", "rename one of them"
         )
+    if any(f.stem == "capture" for f in relights):
+        raise UserError(
+            "a relighting file is named 'capture'",
+            "truth.json keeps the light of the photos under that name",
+            "rename it",
+        )
+
+
+def _check_counts(views: int, test_views: int, resolution: int, spp: int, test_spp: int) -> None:
     for label, value, least in [
         ("views", views, 2),
         ("test_views", test_views, 1),
@@ -311,15 +352,14 @@ def _check(
     ]:
         if value < least:
             raise UserError(f"{label} = {value} is too few", fix=f"at least {least}", code=2)
+    if spp < 1 or test_spp < 1:
+        raise UserError("samples per pixel must be at least 1", code=2)
+
+
+def _check_material(roughness: float | None, metallic: float | None) -> None:
     for label, value in [("roughness", roughness), ("metallic", metallic)]:
         if value is not None and not 0 <= value <= 1:
             raise UserError(f"{label} = {value} is outside [0, 1]", code=2)
-    if spp < 1 or test_spp < 1:
-        raise UserError("samples per pixel must be at least 1", code=2)
-    if truth_bsdf not in ("relit", "principled"):
-        raise UserError(
-            f"unknown truth_bsdf '{truth_bsdf}'", fix="choose relit or principled", code=2
-        )
 
 
 def identity_of(file: Path) -> dict[str, str]:
@@ -349,6 +389,7 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
         for key, value in defaults.items()
         if key not in ("relights", "say")
     }
+    plain["max_depth"] = depth_of(plain["renderer"], plain["max_depth"])
     digests = {what: identity_of(file) for what, file in files.items()}
     return {
         "version": VERSION,
