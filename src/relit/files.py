@@ -28,6 +28,11 @@ except ModuleNotFoundError:  # Python 3.10
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 
+def cache_folder(cache: str | Path | None = None) -> Path:
+    """Where rendered captures and generated objects are kept: `cache`, else RELIT_CACHE, else ~/.cache/relit."""
+    return Path(cache or os.environ.get("RELIT_CACHE") or Path.home() / ".cache" / "relit")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file such that it is either the old or the new one, whenever the process
     dies."""

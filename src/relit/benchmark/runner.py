@@ -19,7 +19,7 @@ from relit.benchmark.results import markdown, means, means_table
 from relit.benchmark.suites import SUITES, Item, Suite, function_at
 from relit.errors import EXIT_FAILED, EXIT_USAGE, UserError, did_you_mean
 from relit.evaluate.results import entries
-from relit.files import write_text
+from relit.files import cache_folder, write_text
 
 
 @dataclass(frozen=True)
@@ -190,11 +190,6 @@ def record_file(suite: str, options: SuiteOptions, seed: int) -> Path:
     return folder / f"{suite}-{options.quality}-{state_of_code()[0]}-{seed}.json"
 
 
-def cache_folder(cache: str | Path | None = None) -> Path:
-    """Where rendered captures are kept: `cache`, else RELIT_CACHE, else ~/.cache/relit."""
-    return Path(cache or os.environ.get("RELIT_CACHE") or Path.home() / ".cache" / "relit")
-
-
 def data_folder(given: str | Path | None = None) -> Path:
     """Folder with `assets` and `envmaps`: `given`, else RELIT_DATA, else shared/data beside the
     working folder or above it."""
@@ -219,17 +214,19 @@ def synthesize_item(
     """The capture of one object, rendered if the cache does not hold it. The folder's name carries
     a hash of all settings."""
     from relit.synthesize.multiview import settings_hash
+    from relit.synthesize.objects import object_file
 
     light = (
         data / item.light if isinstance(item.light, str) else [data / each for each in item.light]
     )
     options = {**suite.options, **item.options, "relights": [data / r for r in suite.relights]}
+    asset = object_file(data / item.asset)
     settings = function_at(suite.synthesize.rpartition(".")[0] + ".settings_of")(
-        data / item.asset, light, **options
+        asset, light, **options
     )
     out = cache / "captures" / f"{item.name}-{settings_hash(settings)}"
     return function_at(suite.synthesize)(
-        data / item.asset, light, out, **options, say=lambda t: say(f"{item.name}: {t}")
+        asset, light, out, **options, say=lambda t: say(f"{item.name}: {t}")
     )
 
 

@@ -17,7 +17,7 @@ Bar = tuple[str, float]  # ('>=' or '<=', value)
 
 @dataclass(frozen=True)
 class Item:
-    """One object of a suite. asset: file relative to the data folder. light: one such file, or
+    """One object of a suite. asset: file relative to the data folder, or procedural:SEED[:KIND]. light: one such file, or
     several (photos under many lights, ...).
     options: what goes to the synthesizer for this object alone, before the suite's own options."""
 

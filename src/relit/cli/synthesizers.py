@@ -19,7 +19,13 @@ def synthesize_flags(parser: Parser) -> None:
         help="kind of capture; see its own --help",
     )
     add = parser.common.add_argument
-    add("--asset", required=True, type=Path, metavar="FILE", help="model: .glb, .gltf or .obj")
+    add(
+        "--asset",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help="model: .glb, .gltf, .obj, or procedural:SEED[:KIND], an object made from a seed",
+    )
     out_flag(parser, "output folder")
     device_flag(parser)
     more = parser.more.add_argument
@@ -29,6 +35,9 @@ def synthesize_flags(parser: Parser) -> None:
 
 
 def do_synthesize(args) -> None:
+    from relit.synthesize.objects import object_file
+
+    args.asset = object_file(args.asset)
     SYNTHESIZERS[args.kind].act(args)
     print(args.out)
 
