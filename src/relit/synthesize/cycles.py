@@ -22,6 +22,7 @@ import tempfile
 import weakref
 from collections import deque
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import IO
 
@@ -56,7 +57,11 @@ def cycles_python() -> str:
 
 def cycles_missing() -> str:
     """Why Cycles cannot be used, '' when it can. Starts the interpreter (half a second)."""
-    python = cycles_python()
+    return _missing(cycles_python())
+
+
+@lru_cache
+def _missing(python: str) -> str:
     if shutil.which(python) is None:
         return f"there is no interpreter {python}"
     tried = subprocess.run(
