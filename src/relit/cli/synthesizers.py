@@ -24,7 +24,7 @@ def synthesize_flags(parser: Parser) -> None:
         required=True,
         type=Path,
         metavar="FILE",
-        help="model: .glb, .gltf, .obj, or procedural:SEED[:KIND], an object made from a seed",
+        help="model: .glb, .gltf, .obj, or procedural:SEED[:KIND]",
     )
     out_flag(parser, "output folder")
     device_flag(parser)
@@ -90,8 +90,7 @@ def multiview_flags(parser: Parser) -> None:
         "--renderer",
         choices=RENDERERS,
         default="relit",
-        help="renderer of the ground truth: relit (the BRDF of fits), mitsuba (its principled "
-        "BSDF) or cycles (Blender; extra 'cycles') (default relit)",
+        help="renderer of the truth: relit (default), mitsuba (principled) or cycles (Blender)",
     )
     sampling_flags(parser, views=60, test_views=12, resolution=400, spp=64, test_spp=256)
 
