@@ -25,6 +25,7 @@ DEFINITION = (
     f"on black; psnr_masked: pixels of true coverage >= {MASK}; gain: truth / ours, per channel, "
     "mean linear radiance inside the mask; psnr_masked_gain: psnr_masked after gain"
 )
+LEAST_SPP = 256  # samples a pixel of our pictures, as many as `relit evaluate` takes
 SEED = 700_000  # apart from the seeds of the truth pictures, whose noise must not cancel
 
 
@@ -34,7 +35,8 @@ def ceiling_under(
     """{"psnr", "psnr_masked", "psnr_masked_gain": dB, "gain": [3]} under one light.
 
     light: EXR of (H, W, 3) radiance in the world frame. pictures: (EXR of linear RGBA, premultiplied
-    on black, its camera) of each test view. spp: samples a pixel of our pictures.
+    on black, its camera) of each test view. spp: samples a pixel of the truth; ours have as many,
+    and at least LEAST_SPP. The noise of both is part of the figures.
     """
     from relit.reference.mitsuba_scene import build_scene, render
 
@@ -43,7 +45,13 @@ def ceiling_under(
     )
     pairs = []
     for i, (file, camera) in enumerate(pictures):
-        ours = render(scene, camera, spp=spp, seed=seed + SEED + i, max_depth=DEPTHS["relit"])
+        ours = render(
+            scene,
+            camera,
+            spp=max(spp, LEAST_SPP),
+            seed=seed + SEED + i,
+            max_depth=DEPTHS["relit"],
+        )
         pairs.append((ours[..., :3], read_data(file)))
     insides = [truth[..., 3] >= MASK for _, truth in pairs]
     seen = [(a[k], t[k][..., :3]) for (a, t), k in zip(pairs, insides, strict=True) if k.any()]

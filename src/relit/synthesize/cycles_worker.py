@@ -124,7 +124,7 @@ def settings(job: dict) -> None:
     camera.data.clip_start, camera.data.clip_end = 1e-3, 1e4
 
 
-def render(view: dict) -> None:
+def render_view(view: dict) -> None:
     """One view into its file."""
     scene = bpy.context.scene
     camera = scene.camera
@@ -139,7 +139,7 @@ def render(view: dict) -> None:
     bpy.ops.render.render(write_still=True)
 
 
-def main(file: str) -> None:
+def serve(file: str) -> None:
     job = json.loads(Path(file).read_text())
     bpy.ops.wm.read_factory_settings(use_empty=True)
     settings(job)
@@ -149,9 +149,9 @@ def main(file: str) -> None:
     make_world(job["light"])
     print(f"RELIT ready {bpy.app.version_string}", flush=True)
     for line in sys.stdin:
-        render(json.loads(line))
+        render_view(json.loads(line))
         print("RELIT done", flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    serve(sys.argv[1])

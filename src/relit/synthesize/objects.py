@@ -192,11 +192,11 @@ def material_of(
         base, roughness = np.broadcast_to(dark, base.shape), np.full(part.shape, glossy)
     else:
         if has_dark:  # a region of dark lacquer: colour and gloss constant
-            lacquer = ramp(-region - 0.9)
+            lacquer = smooth_ramp(-region - 0.9)
             base = base + lacquer[..., None] * (dark - base)
             roughness = roughness + lacquer * (glossy - roughness)
         if has_metal:
-            metallic = ramp(region - 0.6)
+            metallic = smooth_ramp(region - 0.6)
             base = base + metallic[..., None] * (metal - base)
     return Material(
         np.clip(base, 0.01, 1).astype(np.float32),
@@ -209,14 +209,14 @@ def paint(rng: np.random.Generator, points: np.ndarray, part: np.ndarray) -> np.
     """(T, T, 3) linear base colour: per part two colours that blend over the object, and spots of a
     third."""
     blend = ndtr(1.5 * sample(noise_field(rng), points))[..., None]
-    spots = ramp(sample(noise_field(rng, broad=2.6), points) - 0.8)[..., None]
+    spots = smooth_ramp(sample(noise_field(rng, broad=2.6), points) - 0.8)[..., None]
     colours = rng.uniform(0.03, 0.85, (part.max() + 1, 3, 3)) ** 1.5
     a, b, c = (colours[part, k] for k in range(3))
     mixed = a + blend * (b - a)
     return mixed + spots * (c - mixed)
 
 
-def ramp(x: np.ndarray, width: float = 0.1) -> np.ndarray:
+def smooth_ramp(x: np.ndarray, width: float = 0.1) -> np.ndarray:
     """0 below 0, 1 above `width`, smooth between."""
     t = np.clip(x / width, 0, 1)
     return t * t * (3 - 2 * t)
