@@ -34,7 +34,7 @@ def ceiling_under(
 ) -> dict[str, object]:
     """{"psnr", "psnr_masked", "psnr_masked_gain": dB, "gain": [3]} under one light.
 
-    light: EXR of (H, W, 3) radiance in the world frame. pictures: (EXR of linear RGBA, premultiplied
+    light: EXR of (H, W, 3) radiance, world frame. pictures: (EXR of linear RGBA, premultiplied
     on black, its camera) of each test view. spp: samples a pixel of the truth; ours have as many,
     and at least LEAST_SPP. The noise of both is part of the figures.
     """

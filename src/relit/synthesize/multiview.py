@@ -260,7 +260,7 @@ def exposed(
     cameras: Sequence[tuple[str, Camera]],
     max_depth: int,
 ) -> tuple[TruthScene, np.ndarray]:
-    """The scene under a light whose exposure fits the object (`exposure_factor`), and that light."""
+    """The scene under a light whose exposure fits the object (`exposure_factor`), that light."""
     scene = build_truth(renderer, thing, environment, max_depth)
     factor = exposure_factor(scene, cameras, max_depth)
     lit = (environment * factor).astype(np.float32)

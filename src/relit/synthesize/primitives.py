@@ -31,26 +31,31 @@ def grid_points(n: int) -> np.ndarray:
     return np.stack([x, y, z], -1)
 
 
+def length(p: np.ndarray) -> np.ndarray:
+    """Norms of vectors (..., 3)."""
+    return np.sqrt(np.einsum("...k,...k->...", p, p))
+
+
 def superquadric(p: np.ndarray, half: np.ndarray, exponents: tuple[float, float]) -> np.ndarray:
     """Distance of points (..., 3) to a superquadric at the origin (Barr 1981). half: (3,) half
     axes. exponents: (1, 1) is an ellipsoid, towards 0 a box."""
     e1, e2 = exponents
-    x, y, z = (np.maximum(np.abs(p[..., k]) / half[k], 1e-6) for k in range(3))
+    x, y, z = (np.maximum(np.abs(p[..., k]) / float(half[k]), 1e-6) for k in range(3))
     f = (x ** (2 / e2) + z ** (2 / e2)) ** (e2 / e1) + y ** (2 / e1)
-    return np.linalg.norm(p, axis=-1) * (1 - np.maximum(f, 1e-9) ** (-e1 / 2))
+    return length(p) * (1 - np.maximum(f, 1e-9) ** (-e1 / 2))
 
 
 def capsule(p: np.ndarray, a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
     """Distance of points (..., 3) to the segment a b, less `radius`."""
-    along = b - a
-    t = np.clip((p - a) @ along / (along @ along), 0, 1)
-    return np.linalg.norm(p - a - t[..., None] * along, axis=-1) - radius
+    along, q = np.float32(b - a), p - np.float32(a)
+    t = np.clip(q @ along / (along @ along), 0, 1)
+    return length(q - t[..., None] * along) - np.float32(radius)
 
 
 def torus(p: np.ndarray, radius: float, thick: float) -> np.ndarray:
     """Distance of points (..., 3) to a ring about the y axis."""
-    ring = np.hypot(p[..., 0], p[..., 2]) - radius
-    return np.hypot(ring, p[..., 1]) - thick
+    ring = np.hypot(p[..., 0], p[..., 2]) - np.float32(radius)
+    return np.hypot(ring, p[..., 1]) - np.float32(thick)
 
 
 def smooth_union(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
@@ -73,7 +78,7 @@ def random_superquadric(
     """A turned superquadric of random roundness. sizes: range of its half axes."""
     turn = Rotation.random(random_state=rng).as_matrix().astype(np.float32)
     exponents = (float(rng.uniform(0.35, 1.3)), float(rng.uniform(0.35, 1.3)))
-    return superquadric((p - centre) @ turn, rng.uniform(*sizes, 3), exponents)
+    return superquadric((p - np.float32(centre)) @ turn, rng.uniform(*sizes, 3), exponents)
 
 
 def lump(p: np.ndarray, rng: np.random.Generator, bumps: np.ndarray) -> Field:
@@ -88,7 +93,7 @@ def lump(p: np.ndarray, rng: np.random.Generator, bumps: np.ndarray) -> Field:
     for _ in range(rng.integers(0, 3)):
         towards = rng.normal(size=3)
         centre = 0.62 * towards / np.linalg.norm(towards)
-        dent = np.linalg.norm(p - centre, axis=-1) - rng.uniform(0.2, 0.32)
+        dent = length(p - np.float32(centre)) - rng.uniform(0.2, 0.32)
         distance = -smooth_union(-distance, dent, 0.05)
     return Field(distance.astype(np.float32), field.part)
 
@@ -97,10 +102,10 @@ def bowl(p: np.ndarray, rng: np.random.Generator, bumps: np.ndarray) -> Field:
     """An open bowl on a foot with three to five things in it. Part 0 is the bowl."""
     depth, wide, wall = rng.uniform(0.4, 0.65), rng.uniform(0.7, 0.85), rng.uniform(0.035, 0.05)
     half = np.array([wide, depth, wide])
-    q = p - np.array([0, 0.4, 0], np.float32)  # the rim is at y = .4
+    q = p - np.float32([0, 0.4, 0])  # the rim is at y = .4
     body = superquadric(q, half, (float(rng.uniform(0.6, 1.1)), 1.0))
     shell = np.maximum(np.abs(body) - wall, q[..., 1])
-    foot = torus(p - np.array([0, 0.4 - depth, 0]), rng.uniform(0.25, 0.4), 0.05)
+    foot = torus(p - np.float32([0, 0.4 - depth, 0]), rng.uniform(0.25, 0.4), 0.05)
     vessel = smooth_union(shell, foot, 0.06)
     things = []
     count = int(rng.integers(3, 6))
@@ -123,11 +128,11 @@ def strut_frame(p: np.ndarray, rng: np.random.Generator) -> Field:
         for j in np.argsort(distance)[:2]:
             parts.append(capsule(p, nodes[k], nodes[j], rng.uniform(0.03, 0.045)))
     for node, flat in ((nodes[0], False), (nodes[1], True)):
-        turn = Rotation.random(random_state=rng).as_matrix()
+        turn = Rotation.random(random_state=rng).as_matrix().astype(np.float32)
         radius = rng.uniform(0.25, 0.38)
         centre = np.clip(node, -REACH + radius, REACH - radius)
         parts.append(capsule(p, node, centre + 1e-3, 0.035))
-        q = (p - centre) @ turn
+        q = (p - np.float32(centre)) @ turn
         if flat:
             parts.append(superquadric(q, np.array([radius, 0.035, radius]), (0.5, 1.0)))
         else:
