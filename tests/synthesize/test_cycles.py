@@ -95,12 +95,19 @@ def test_blenders_map_in_blenders_axes_is_ours_in_ours():
     np.testing.assert_allclose(np.arccos(z) / np.pi, ours[:, 1], atol=1e-6)
 
 
-def test_a_missing_blender_is_explained(monkeypatch):
+def test_a_missing_blender_is_explained(monkeypatch, tmp_path):
     thing = ball()
     monkeypatch.setenv(cycles.PYTHON, "/nowhere/python")
     with pytest.raises(UserError, match="cycles is not there") as caught:
         build_truth("cycles", thing, LIGHT, 10)
     assert "pip install" in str(caught.value.fix) and cycles.PYTHON in str(caught.value.fix)
+    for name in ("asset.glb", "light.exr"):
+        (tmp_path / name).touch()
+    with pytest.raises(UserError, match="cycles is not there"):
+        synthesize_multiview(
+            tmp_path / "asset.glb", tmp_path / "light.exr", tmp_path / "out", renderer="cycles"
+        )
+    assert not (tmp_path / "out").exists()
     monkeypatch.setenv(cycles.PYTHON, sys.executable)
     if cycles.cycles_missing():  # this interpreter has no bpy
         with pytest.raises(UserError, match="cycles is not there"):

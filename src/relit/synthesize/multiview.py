@@ -47,6 +47,7 @@ from relit.synthesize.renderers import (
     build_truth,
     depth_of,
     describe_renderer,
+    require_renderer,
     truth_picture,
 )
 
@@ -112,6 +113,8 @@ def synthesize_multiview(
         metallic=metallic,
         max_depth=max_depth,
     )
+    if not (out / "truth" / "truth.json").exists():
+        require_renderer(renderer)  # before anything is written
     if claim_folder(out, settings):
         return out
 

@@ -38,6 +38,14 @@ def depth_of(renderer: str, max_depth: int | None) -> int:
     return DEPTHS[renderer] if max_depth is None else max_depth
 
 
+def require_renderer(renderer: str) -> None:
+    """Raise UserError, with the commands that install it, where a renderer is missing."""
+    if renderer == "cycles":
+        from relit.synthesize.cycles import require_cycles
+
+        require_cycles()
+
+
 @dataclass(frozen=True)
 class TrueObject:
     """The object of a capture, its material, and world_from_asset (4, 4)."""
