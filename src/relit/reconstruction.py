@@ -40,6 +40,7 @@ def reconstruct(
     config: str | Path | None = None,
     overwrite: bool = False,
     report: bool = True,
+    force: bool = False,
     **flags,
 ) -> Path:
     """Photos -> `out`/asset; returns the asset folder. Giving the same call again resumes or finds
@@ -48,7 +49,8 @@ def reconstruct(
     flags: the fields of `Job`; None means not given. config: a TOML file whose values stand where
     no flag was given. pairs: 'key=value'
     texts, settings: {key: value}, both for the fields of the recipe's options (for example
-    `relit.fit.multiview.recipe.MultiviewOptions`). report: write report.html as well.
+    `relit.fit.multiview.recipe.MultiviewOptions`). report: write report.html as well. force: keep a result that its own evidence does not
+    bear out, which is refused (4) otherwise.
     Raises UserError for bad input (3), a failed reconstruction (4), a lack of the machine (5),
     unknown settings (2).
     """
@@ -71,6 +73,7 @@ def reconstruct(
         "settings": dataclasses.asdict(options),
     }
     with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
+        run.force = force
         asset_folder = run.folder / "asset"
         finished = run.done("asset") and (asset_folder / "asset.json").is_file()
         reported = run.done("report") and (run.folder / "report.html").is_file()

@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from relit.errors import EXIT_ENVIRONMENT, EXIT_USAGE, UserError
+from relit.errors import EXIT_ENVIRONMENT, EXIT_FAILED, EXIT_USAGE, UserError
 from relit.files import (
     NO_ARRAYS,
     disk_errors,
@@ -61,10 +61,13 @@ STOPS: dict[int, type[BaseException]] = {
 
 
 class Run:
-    """One run folder, held by this process. Make it with `Run.open`; it is a context manager."""
+    """One run folder, held by this process. Make it with `Run.open`; it is a context manager.
+
+    force: keep a result that its own evidence does not bear out, see `refuse`.
+    """
 
     def __init__(self, folder: Path, config: dict, lock: int, log: Log):
-        self.folder, self.config, self.log = folder, config, log
+        self.folder, self.config, self.log, self.force = folder, config, log, False
         self._unlock = weakref.finalize(self, os.close, lock)
 
     @staticmethod
@@ -133,6 +136,13 @@ class Run:
     def say(self, text: str) -> None:
         """One log line, on stderr and in log.txt."""
         self.log.say(text)
+
+    def refuse(self, what: str, why: str, fix: str) -> None:
+        """For a result that its own evidence does not bear out: raise UserError with exit code 4, or
+        with `force` say it and go on."""
+        if not self.force:
+            raise UserError(what, why, f"{fix}; --force keeps the result", code=EXIT_FAILED)
+        self.say(f"note: kept by --force, although {what} ({why})")
 
     def progress(self, title: str, steps: int | None = None) -> Callable[[int], None]:
         """A progress line for steps besides those of a stage: call it with how many are over.

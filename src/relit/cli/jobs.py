@@ -138,6 +138,11 @@ def reconstruct_flags(parser: Parser) -> None:
     )
     opening_flags(parser)
     overwrite_flag(parser, "delete an earlier run in the folder and start again")
+    parser.more.add_argument(
+        "--force",
+        action="store_true",
+        help="keep a result that the photos do not bear out (exit code 4 otherwise)",
+    )
 
 
 def do_reconstruct(args) -> None:
@@ -154,6 +159,7 @@ def do_reconstruct(args) -> None:
         config=args.config,
         **{name: getattr(args, name) for name in OPENING},
         overwrite=args.overwrite,
+        force=args.force,
     )
     print(asset / "object.glb")
 

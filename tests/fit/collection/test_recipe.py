@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from relit.errors import UserError
+from relit.run import Run
 
 mi = pytest.importorskip("mitsuba")
 
@@ -297,29 +298,28 @@ def test_noise_is_no_object(tmp_path):
     assert raised.value.code == 4
 
 
-def test_verdicts():
+def test_verdicts(tmp_path):
     """A mean score or an agreement that is too low ends the run; a photo far below the others is
     named."""
-    from types import SimpleNamespace
-
     from relit.fit.collection.options import CollectionOptions
-    from relit.fit.collection.photo_poses import PhotoPoses, judge_poses
+    from relit.fit.collection.photo_poses import PhotoPoses, PoseEvidence, judge_poses
 
-    said = []
-    run, options = SimpleNamespace(say=said.append), CollectionOptions()
-    names = [f"{i}.jpg" for i in range(14)]
+    options, names = CollectionOptions(), [f"{i}.jpg" for i in range(14)]
 
     def judged(scores, share):
         count = len(scores)
-        found = PhotoPoses(np.tile(np.eye(4), (count, 1, 1)), scores, share, np.zeros(count, bool))
-        judge_poses(found, names[:count], options, run)
+        evidence = PoseEvidence(float(np.mean(scores)), share, np.nan)
+        poses, none = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
+        found = PhotoPoses(poses, scores, none, np.ones(count), "search", evidence)
+        with Run.open(tmp_path / "run", {}) as run:
+            judge_poses(found, names[:count], options, run)
+        return (tmp_path / "run" / "log.txt").read_text()
 
     scores = np.full(14, 0.95) + np.linspace(-0.01, 0.01, 14)
     scores[5] = 0.7
-    judged(scores, 0.4)
-    assert any("1 photos agree badly" in text and "5.jpg" in text for text in said)
-    judged(scores[:8], np.nan)
-    assert any("nothing tells" in text for text in said)
+    said = judged(scores, 0.4)
+    assert "1 photos agree badly" in said and "5.jpg" in said
+    assert "nothing tells" in judged(scores[:8], np.nan)
     for low, share in ((scores - 0.3, 0.4), (scores, 0.1)):
         with pytest.raises(UserError, match="could not be found") as raised:
             judged(low, share)

@@ -30,9 +30,9 @@ from support import flash_ball as scene
 
 def test_poses_that_were_refused_are_refused_again(tmp_path, monkeypatch):
     photos = SimpleNamespace(names=[f"{i}.jpg" for i in range(6)])
-    found = photo_poses.PhotoPoses(
-        np.tile(np.eye(4), (6, 1, 1)), np.full(6, 0.4), np.nan, np.zeros(6, bool)
-    )
+    evidence = photo_poses.PoseEvidence(0.4, np.nan, np.nan)
+    poses, none = np.tile(np.eye(4), (6, 1, 1)), np.zeros(6, bool)
+    found = photo_poses.PhotoPoses(poses, np.full(6, 0.4), none, np.ones(6), "search", evidence)
     searched = []
     monkeypatch.setattr(photo_poses, "find_all", lambda *_: searched.append(1) or found)
     for _ in range(2):

@@ -7,8 +7,9 @@ import pytest
 import trimesh
 
 from relit.errors import UserError
-from relit.fit.shape.odd_photos import check_masks, mask_overlaps
+from relit.fit.shape.odd_photos import check_overlaps, mask_overlaps, note_of_odd_photos
 from relit.geometry.se3 import look_at
+from relit.run import Run
 from relit.scene import Camera, Mesh
 
 SIDE = 160
@@ -49,7 +50,7 @@ def test_masks_that_the_shape_fills_are_not_spoken_of(device):
     mesh, cameras, masks = seen()
     overlaps = mask_overlaps(mesh, cameras, masks)
     assert overlaps.min() > 0.97
-    assert check_masks(mesh, cameras, masks, [f"{k}.png" for k in range(6)]) == ""
+    assert note_of_odd_photos(overlaps, [f"{k}.png" for k in range(6)]) == ""
     assert (
         mask_overlaps(mesh, cameras[:1], [np.zeros((SIDE, SIDE), np.float32)])[0] == 0
     )  # a silhouette where the mask has none
@@ -66,17 +67,18 @@ def test_one_that_it_does_not_fill_is_named(device):
     assert overlaps[2] == pytest.approx(
         lens / (2 * np.pi * radius**2 - lens), abs=0.02
     )  # two discs, as far apart
-    note = check_masks(mesh, cameras, masks, [f"{k}.png" for k in range(6)])
+    note = note_of_odd_photos(overlaps, [f"{k}.png" for k in range(6)])
     assert "1 of 6 photos" in note and "2.png" in note and "3.png" not in note
 
 
-def test_a_shape_that_fills_hardly_any_is_no_result(device):
+def test_a_shape_that_fills_hardly_any_is_refused(device, tmp_path):
     mesh, cameras, masks = seen()
-    with pytest.raises(UserError, match="does not fill the masks") as raised:
-        check_masks(
-            mesh,
-            cameras,
-            [np.roll(m, SIDE // 3, axis=1) for m in masks],
-            [f"{k}.png" for k in range(6)],
-        )
-    assert "--sphere" in raised.value.fix
+    overlaps = mask_overlaps(mesh, cameras, [np.roll(m, SIDE // 3, axis=1) for m in masks])
+    with Run.open(tmp_path / "run", {}) as run:
+        with pytest.raises(UserError, match="does not fill the masks") as raised:
+            check_overlaps(overlaps, run)
+        assert raised.value.code == 4 and "--sphere" in raised.value.fix
+        assert "--force" in raised.value.fix
+        run.force = True
+        check_overlaps(overlaps, run)
+        assert "kept by --force" in (run.folder / "log.txt").read_text()

@@ -3,7 +3,7 @@ guess of the focal length."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +57,14 @@ class PhotoSet:
     def tints(self) -> np.ndarray:
         """(P, 3) mean linear colour of the object in each of `shots`."""
         return np.array([s.tint for s in self.shots])
+
+    def with_cameras(self, cameras: list[Camera]) -> PhotoSet:
+        """The set with the intrinsics of these cameras for `shots`."""
+        none = np.eye(4)
+        shots = [
+            replace(s, camera=c.with_pose(none)) for s, c in zip(self.shots, cameras, strict=True)
+        ]
+        return replace(self, shots=shots)
 
     @property
     def names(self) -> list[str]:

@@ -33,9 +33,9 @@ from relit.fit.collection.held_out import (
     held_out_stage,
     look_again,
 )
-from relit.fit.collection.links import LinkedGroups, links_stage, with_focals
+from relit.fit.collection.links import LinkedGroups, links_stage
 from relit.fit.collection.options import CollectionOptions, options_for
-from relit.fit.collection.photo_poses import pose_stage
+from relit.fit.collection.photo_poses import BORNE_OUT, PhotoPoses, pose_stage
 from relit.fit.collection.photos import LEAST_PHOTOS, PhotoSet, load_shots
 from relit.fit.collection.shape import FittedShape, opened_stage, volume_stage
 from relit.fit.collection.surface import (
@@ -47,6 +47,7 @@ from relit.fit.collection.surface import (
     light_options,
     start_collection_surface,
 )
+from relit.fit.collection.verdict import check_borne_out
 from relit.fit.passes.material_priors import ALBEDO_START, SurfaceOptions
 from relit.fit.passes.volume import VolumeModel
 from relit.fit.registration.photos.poses import GREY
@@ -68,7 +69,6 @@ EXCHANGE = 14.0
 # of SurfaceOptions: under many lights a photo's shade is not taken for paint, and smoothing blurs
 # what is paint
 SMOOTH_COLOUR = 0.05
-BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to be in its place
 # share of photos that fit as well elsewhere from which on the object is called alike from several
 # sides: the stool of the suite `collection` has .02 with quadrants and .32 without
 ALIKE = 0.15
@@ -85,10 +85,10 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
         linked = LinkedGroups(())
     else:
         linked = links_stage(photos.shots, run, seed)
-    photos = replace(photos, shots=with_focals(photos.shots, linked.groups))
     poses = pose_stage(photos, linked.groups, fit)
+    photos = photos.with_cameras(poses.cameras(photos.shots))
     shape = volume_stage(photos, poses, fit)
-    second_look_stage(shape, photos, poses.linked, fit)
+    second_look_stage(shape, photos, poses, fit)
     opened_stage(shape, photos, fit)
     colours = mesh_stage(shape.model, fit)
     maps = surface_stage(shape, photos, colours, fit)
@@ -100,16 +100,16 @@ def reconstruct(capture: Capture, run, options: CollectionOptions, seed: int = 0
 
 
 def second_look_stage(
-    shape: FittedShape, photos: PhotoSet, linked: np.ndarray, fit: FitContext
+    shape: FittedShape, photos: PhotoSet, poses: PhotoPoses, fit: FitContext
 ) -> None:
-    """Search lost photos again in the finished shape (`linked` ones (P,) are not lost); `shape`
-    takes their cameras."""
+    """Search lost photos again in the finished shape (those placed by matches are not lost); `shape`
+    takes their cameras. Refuses poses that all evidence contradicts."""
     run, options, names = fit.run, fit.options, photos.names
     if "search" in options.without:
         return
 
     def computed(stage) -> SecondLook:
-        seen = look_again(shape, photos, linked, fit)
+        seen = look_again(shape, photos, poses.linked, fit)
         named = ", ".join(names[i] for i in seen.moved[:5])
         run.say(
             f"{len(seen.moved)} photos moved to where they fit better{': ' if len(seen.moved) else ''}{named}"
@@ -118,7 +118,10 @@ def second_look_stage(
         return seen
 
     title = "lost photos are looked for in the finished shape"
-    shape.place(run.cached("second_look", SecondLook, computed, title=title).placed(shape.cameras))
+    seen = run.cached("second_look", SecondLook, computed, title=title)
+    shape.place(seen.placed(shape.cameras))
+    borne_out = float((seen.detail >= BORNE_OUT).mean())
+    check_borne_out(photos, shape.cameras, poses.evidence.agreement, borne_out, run)
 
 
 def say_borne_out(detail: np.ndarray, as_well: np.ndarray, names: list[str], run) -> None:

@@ -346,7 +346,7 @@ def mesh_stage(photos: UnitPhotos, volume: VolumeResult, fit: FitContext) -> Fla
     def computed(stage) -> FlashMesh:
         mesh = extract_mesh(volume.values, faces=options.faces)
         rounds = 0 if "refinement" in options.without else options.outlines
-        mesh = outlined_mesh(mesh, photos, photos.cameras, rounds, run.say)
+        mesh = outlined_mesh(mesh, photos, photos.cameras, rounds, run)
         mesh = with_atlas(mesh, options.texture, run.say)
         albedo = np.maximum(features_at(volume.grid(), volume.features, mesh.vertices), 0)
         return FlashMesh(

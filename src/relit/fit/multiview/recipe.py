@@ -333,7 +333,7 @@ def mesh_stage(photos: UnitPhotos, volume: VolumeResult, fit: FitContext) -> Rad
         if photos.masks is None:
             mesh = without_unseen(mesh, found)
         else:
-            mesh = outlined_mesh(mesh, photos, found, options.outlines, run.say)
+            mesh = outlined_mesh(mesh, photos, found, options.outlines, run)
         mesh = with_atlas(mesh, options.texture, run.say)
         grid, reflections = volume.grid(), mi.Float(volume.reflections)
         return RadiantMesh(mesh, mean_radiance(grid, volume.features, reflections, mesh.vertices))

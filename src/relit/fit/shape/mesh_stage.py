@@ -9,10 +9,11 @@ import numpy as np
 
 from relit.fit.passes.load_photos import UnitPhotos
 from relit.fit.shape.inpaint import painted_over
-from relit.fit.shape.odd_photos import check_masks
+from relit.fit.shape.odd_photos import check_overlaps, mask_overlaps, note_of_odd_photos
 from relit.fit.shape.outlines import follow_outlines
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
+from relit.run import Run
 from relit.scene import Camera, Mesh
 
 
@@ -21,14 +22,16 @@ def outlined_mesh(
     photos: UnitPhotos,
     cameras: Sequence[Camera],
     rounds: int,
-    say: Callable[[str], None],
+    run: Run,
 ) -> Mesh:
     """The mesh after `rounds` rounds in which its outlines follow the masks. cameras: those of the
     photos, as the mesh has them. Photos whose masks it does not fill are named; raises UserError
     where it fills hardly any."""
     mesh = follow_outlines(mesh, cameras, photos.masks, rounds)
-    if note := check_masks(mesh, cameras, photos.masks, photos.names):
-        say(note)
+    overlaps = mask_overlaps(mesh, cameras, photos.masks)
+    check_overlaps(overlaps, run)
+    if note := note_of_odd_photos(overlaps, photos.names):
+        run.say(note)
     return mesh
 
 

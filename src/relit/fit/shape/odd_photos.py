@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from relit.errors import EXIT_FAILED, UserError
 from relit.fit.shape.outlines import trace_rays
 from relit.reference.mitsuba_scene import build_geometry
+from relit.run import Run
 from relit.scene import Camera, Mesh
 
 OVERLAP = 0.8  # less is odd; see `mask_overlaps`
@@ -41,19 +41,18 @@ def mask_overlaps(mesh: Mesh, cameras: Sequence[Camera], masks: Sequence[np.ndar
     return np.array(out)
 
 
-def check_masks(
-    mesh: Mesh, cameras: Sequence[Camera], masks: Sequence[np.ndarray], names: Sequence[str]
-) -> str:
-    """What is to be said of photos whose masks the shape does not fill, or "". Raises UserError
-    where it fills hardly any."""
-    overlaps = mask_overlaps(mesh, cameras, masks)
+def check_overlaps(overlaps: np.ndarray, run: Run) -> None:
+    """Refuse a shape that fills hardly any mask. overlaps: of `mask_overlaps`."""
     if np.median(overlaps) < NOTHING:
-        raise UserError(
+        run.refuse(
             f"the shape does not fill the masks (intersection over union {np.median(overlaps):.2f}, median of the photos)",
             "the cameras or the masks are wrong, or the object sphere misses the object",
             "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS",
-            code=EXIT_FAILED,
         )
+
+
+def note_of_odd_photos(overlaps: np.ndarray, names: Sequence[str]) -> str:
+    """A line on photos whose masks the shape does not fill, or ""."""
     odd = [k for k in np.argsort(overlaps) if overlaps[k] < OVERLAP]
     if not odd:
         return ""
