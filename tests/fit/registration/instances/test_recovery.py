@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,13 +12,21 @@ from scipy.spatial.transform import Rotation
 from relit.conventions import similarity
 from relit.fit.duplicates.recover_unregistered import carried
 from relit.fit.registration.instances import recovery as module
-from relit.fit.registration.instances.azimuth import turned_by
 from relit.fit.registration.instances.azimuth_maps import turned_about
 from relit.fit.registration.instances.outliers import view_errors
 from relit.fit.registration.instances.recovery import sought_again
-from relit.fit.registration.instances.views import InstanceView, overlaps, pixel_bank
-from relit.fit.registration.register import volume_render
-from relit.geometry.revolution_axis import Axis
+from relit.fit.registration.instances.views import (
+    InstanceView,
+    albedo_render,
+    overlaps,
+    pixel_bank,
+)
+from relit.fit.registration.register import (
+    directions_around,
+    make_galleries,
+    views_from,
+    volume_render,
+)
 from relit.geometry.se3 import rotation_angle
 from relit.rendering.appearance.world_light import shade_world, start_world_light
 from support.volume_lump import photos_of, volume_lump
@@ -26,6 +34,12 @@ from support.volume_lump import photos_of, volume_lump
 
 def none(seed):
     """No galleries: places are given."""
+
+
+def galleries_around(model, directions, distance):
+    """As `galleries_of`, from a few directions (V, 3)."""
+    views = views_from(directions, distance)
+    return make_galleries(albedo_render(model), views, module.PLACED)
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +72,14 @@ def lump():
 
 def test_it_is_found_though_half_of_it_is_hidden_and_it_stands_in_the_shade(lump, monkeypatch):
     model, (guide, hidden), poses = lump
-    monkeypatch.setattr(module, "VIEWPOINTS", 500)
     monkeypatch.setattr(module, "STEPS", 120)
     before = [np.array(a) for a in (model.grid.features, model.grid.row_values, model.reflections)]
-    galleries = cache(partial(module.galleries_of, model, float(np.linalg.norm(poses[0, :3, 3]))))
+    far = float(np.linalg.norm(poses[0, :3, 3]))
+
+    @cache
+    def galleries(seed):
+        return galleries_around(model, directions_around(500, seed), far)
+
     level = (
         float(view_errors(pixel_bank([hidden], poses[:1]), model)[0]) / 80
     )  # a tenth of what it is at a wrong place agrees
@@ -80,109 +98,87 @@ def test_it_is_found_though_half_of_it_is_hidden_and_it_stands_in_the_shade(lump
     )  # the model itself stays
 
 
-def test_where_several_places_agree_it_stays_out(lump, monkeypatch):
-    model, (guide, hidden), poses = lump
-    turned = poses[[1, 1]]
-    turned[1, :3] = np.diag([-1.0, 1.0, -1.0]) @ turned[1, :3]
-    monkeypatch.setattr(module, "candidates", lambda *_: turned)
-    for errors, out in (([1.0, 1.5], True), ([1.0, 3.0], False), ([9.0, 30.0], True)):
-        monkeypatch.setattr(module, "refine_candidates", lambda *_, e=errors: (turned, np.array(e)))
-        assert (sought_again(hidden, guide, poses[0], model, 1.0, None, none)[0] is None) == out
-
-
-def test_of_a_body_of_revolution_the_best_place_whose_silhouette_agrees_is_turned(
-    lump, monkeypatch
-):
-    model, (guide, _), poses = lump
-    shifted = poses[[0, 0, 0]]
-    shifted[1, :3, 3] += [0.4, 0.0, 0.0]
-    shifted[2, :3, 3] += [0.01, 0.0, 0.0]
-    shares = overlaps(volume_render(model), guide, shifted)
-    assert shares[0] > 0.97 and shares[1] < 0.8 < shares[2]
-    axis = Axis(np.array([0.1, 0.0, -0.2]), np.array([0.6, 0.8, 0.0]))
-    tried = np.stack([turned_by(poses[0], axis, 1.01), shifted[1]])
-    monkeypatch.setattr(module, "candidates", lambda *_: tried)
-    monkeypatch.setattr(
-        module, "refine_candidates", lambda *_: (tried, np.array([50.0, 20.0]))
-    )  # nothing agrees, least where the outline does not
-    monkeypatch.setattr(
-        module, "overlaps", lambda render, _, some: np.where(np.arange(len(some)) % 2 > 0, 0.5, 1)
-    )
-
-    asked = []
-
-    def turned(view, pose):
-        asked.append(view)
-        return turned_by(pose, axis, -1.01)
-
-    found, sure = sought_again(guide, guide, poses[0], model, 1.0, None, none, turned=turned)
-    assert np.allclose(found, poses[0]) and not sure and asked == [guide]
-    assert sought_again(guide, guide, poses[0], model, 1.0, None, none) == (None, False), (
-        "not a body of revolution"
-    )
-    monkeypatch.setattr(module, "overlaps", lambda render, view, some: np.full(len(some), 0.5))
-    assert sought_again(guide, guide, poses[0], model, 1.0, None, none, turned=turned) == (
-        None,
-        False,
-    )
-
-
-def test_where_no_place_agrees_others_are_tried(lump, monkeypatch):
-    _, (guide, hidden), poses = lump
-    asked = []
-
-    def found(errors_of_turn):
-        asked.clear()
-
-        def descended(*rest):
-            asked.append(rest[-1])
-            return poses[[1, 0]], np.array(errors_of_turn[len(asked) - 1])
-
-        monkeypatch.setattr(module, "refine_candidates", descended)
-        return sought_again(hidden, guide, poses[0], None, 1.0, None, none, 5)[0]
-
-    monkeypatch.setattr(module, "candidates", lambda *_: poses[[1, 0]])
-    assert np.array_equal(found([[20.0, 30.0], [3.0, 30.0]]), poses[1]) and asked == [5, 6]
-    assert found([[20.0, 30.0]] * 3) is None and asked == [5, 6, 7]
+def apart(*degrees):
+    """Places (K, 4, 4) turned by these degrees about one axis."""
+    return np.array([turned_about(np.eye(4), np.radians(a)) for a in degrees])
 
 
 @pytest.mark.parametrize(
-    "first, then, taken, rounds",
+    "errors, best, certain",
     [
-        ([20.0, 30.0], [11.0, 14.0], True, 1),  # nearly
-        ([20.0, 30.0], [18.0, 30.0], True, 1),  # it leads clearly
-        ([20.0, 30.0], [18.0, 26.0], False, 3),  # it does not
-        ([30.0, 60.0], [22.0, 60.0], False, 3),  # it leads, but too far off
-        ([20.0, 30.0], [7.0, 30.0], True, 1),  # certain by then
-        ([45.0, 90.0], None, False, 1),  # nothing like it
-        ([np.nan, np.nan], None, False, 1),  # no pixel is whole
+        ([7.0, 15.0], 0, True),
+        ([7.0, 13.0], 0, False),  # another place agrees nearly as well
+        ([9.0, 30.0], 0, False),  # nothing agrees
+        ([30.0, 3.0], 1, True),
     ],
 )
-def test_the_best_places_are_looked_into_where_none_is_certain(
-    lump, monkeypatch, first, then, taken, rounds
-):
-    _, (guide, hidden), poses = lump
-    asked = []
+def test_a_place_is_certain_where_it_alone_agrees(errors, best, certain):
+    places = apart(0, 90)
+    pose, sure = module.most_likely_pose(places, np.array(errors), 1.0)
+    assert np.array_equal(pose, places[best]) and sure == certain
 
-    def descended(view, guide, guide_pose, tried, model, turns, steps, seed):
-        asked.append((steps, len(tried)))
-        return tried, np.array(
-            [*first, first[1] + 1, first[1] + 60] if steps == module.STEPS else then
-        )
 
-    turned = turned_about(poses[1], 0.1)  # of one place the better descent counts
-    monkeypatch.setattr(
-        module,
-        "candidates",
-        lambda *_: np.stack([poses[1], poses[0], turned_about(poses[0], 0.1), turned]),
-    )
-    monkeypatch.setattr(module, "refine_candidates", descended)
-    pose, sure = sought_again(hidden, guide, poses[0], None, 1.0, None, none, 5, guess=True)
-    assert asked == (
-        [(module.STEPS, 4), (module.LONGER, 2)] * rounds if then else [(module.STEPS, 4)]
-    )
-    assert sure == (then is not None and then[0] < module.AGREES)
-    assert pose is None if not taken else np.array_equal(pose, poses[1])
+@pytest.mark.parametrize(
+    "errors, taken",
+    [
+        ([11.0, 14.0], True),  # nearly certain
+        ([18.0, 30.0], True),  # it leads clearly
+        ([18.0, 26.0], False),  # it does not
+        ([22.0, 60.0], False),  # it leads, but too far off
+    ],
+)
+def test_which_places_are_worth_a_trial(errors, taken):
+    assert module.worth_a_trial(apart(0, 90), np.array(errors), 1.0) == taken
+
+
+def test_of_places_that_are_nearly_the_same_the_better_descent_counts():
+    places = apart(5, 90, 0, 95)
+    assert module.best_places(places, np.array([30.0, 26.0, 18.0, np.nan])) == [2, 1]
+    # its neighbour is no rival of the best place
+    assert module.most_likely_pose(places, np.array([3.0, 50.0, 2.0, 60.0]), 1.0)[1]
+
+
+def test_places_count_whose_silhouettes_agree_about_as_well_as_the_best(lump):
+    """What is in the wrong place by a fifth of its radius can still overlap by .95, and agree in
+    colour by chance."""
+    model, (guide, _), poses = lump
+    shifted = poses[[0, 0, 0, 0]]
+    shifted[:, 0, 3] += [0.006, 0.008, 0.013, 0.4]
+    left = 1 - overlaps(volume_render(model), guide, shifted)
+    assert left[1] < 1.5 * left[0] < left[2] < 0.05 and left[3] > 0.2, left
+    errors = np.array([3.0, 2.0, 1.5, 1.0])
+    found = module.where_outlines_agree(errors, guide, shifted, model)
+    assert np.isfinite(found).tolist() == [True, True, False, False]
+    assert not np.isfinite(module.where_outlines_agree(errors[3:], guide, shifted[3:], model)).any()
+
+
+def test_where_no_place_is_certain(lump, monkeypatch):
+    """Other places are tried with other seeds; of a body of revolution the best place whose
+    silhouette agrees is turned to what the others show."""
+    model, (guide, _), poses = lump
+    monkeypatch.setattr(module, "STEPS", 1)
+    seeds, asked = [], []
+
+    def near(seed):
+        seeds.append(seed)
+        far = np.linalg.norm(poses[:, :3, 3], axis=1)
+        return galleries_around(model, poses[:, :3, 3] / far[:, None], far.mean())
+
+    def turned(view, pose):
+        asked.append((view, pose))
+        return turned_about(pose, 0.3)
+
+    nothing = 1e-9  # level of the errors with which nothing agrees
+    rest = (guide, guide, poses[0], model)
+    assert sought_again(*rest, nothing, None, near, 5) == (None, False) and seeds == [5, 6, 7]
+    seeds.clear()
+    found, sure = sought_again(*rest, nothing, None, near, 5, turned=turned)
+    assert not sure and seeds == [5] and len(asked) == 1 and asked[0][0] is guide
+    assert rotation_angle(asked[0][1][:3, :3].T @ poses[0][:3, :3]) < 5
+    assert np.array_equal(found, turned_about(asked[0][1], 0.3))
+    seeds.clear()  # hopeless: no guess is sought on
+    assert sought_again(*rest, nothing, None, near, 5, guess=True) == (None, False)
+    assert seeds == [5]
 
 
 def test_of_one_whose_axis_is_known_all_turns_are_tried_and_the_best_is_taken(lump, monkeypatch):
@@ -213,19 +209,3 @@ def test_poses_are_carried_along_with_those_that_passes_have_moved():
     )
     there = carried({7: before[5]}, before[:5], after[:5])
     assert np.allclose(there[7], after[5])
-
-
-@pytest.mark.parametrize(
-    "shared, there",
-    [
-        ([0.99, 0.986, 0.96], [1, 1, 0]),
-        ([0.96, 0.951, 0.93], [1, 1, 0]),
-        ([0.94, 0.93, 0.9], [0, 0, 0]),
-    ],
-)
-def test_places_count_whose_silhouettes_agree_about_as_well_as_the_best(monkeypatch, shared, there):
-    """What is in the wrong place by a fifth of its radius can still overlap by .95, and agree in
-    colour by chance."""
-    monkeypatch.setattr(module, "overlaps", lambda render, view, poses: np.array(shared))
-    found = module.where_outlines_agree(np.array([3.0, 2.0, 1.0]), None, None, None)
-    assert np.array_equal(np.isfinite(found), np.array(there, bool))
