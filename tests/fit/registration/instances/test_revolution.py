@@ -17,7 +17,7 @@ from relit.fit.registration.instances.azimuth_maps import (
     empty_board,
     turned_about,
 )
-from relit.fit.registration.instances.options import Search
+from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.protrusions import (
     EMPTY,
     FILLED_OR_EMPTY,
@@ -25,12 +25,12 @@ from relit.fit.registration.instances.protrusions import (
     filled,
     turned_by_outline,
 )
+from relit.fit.registration.instances.regrowth import Placed
 from relit.fit.registration.instances.revolution import KNOTS, OUTLINE, axis_of, drawn, leaning_back
 from relit.fit.registration.instances.revolution_fit import (
     Revolved,
     adjusted_pose,
     crop_outline,
-    fit_revolution,
     leaning_the_other_way,
     refine_revolution,
     seats_of,
@@ -38,6 +38,7 @@ from relit.fit.registration.instances.revolution_fit import (
 from relit.fit.registration.instances.revolution_search import (
     EXACT,
     LONGER,
+    RevolvedPlaces,
     lies_on_plane,
     place_revolved,
 )
@@ -107,11 +108,32 @@ def pile(points, colours, count: int, seed: int) -> tuple[list[InstanceView], np
     return [seen(points, colours, pose, k + 1) for k, pose in enumerate(poses)], poses
 
 
+PROFILE = np.concatenate(
+    [
+        [-0.75, 0.75],
+        np.interp(
+            np.linspace(-0.75, 0.75, KNOTS), [-0.75, 0.15, 0.4, 0.75], [0.36, 0.36, 0.15, 0.15]
+        ),
+    ]
+)  # of a bottle
+
+
 @pytest.fixture(scope="module")
-def bottles():
+def shots():
+    """Views of bottles, their crops and poses."""
     views, poses = pile(*bottle(), 7, 3)
-    crops = instance_crops(views)
-    body = fit_revolution(views, crops)
+    return views, instance_crops(views), poses
+
+
+@pytest.fixture(scope="module")
+def bottles(shots):
+    """Views, crops and poses of bottles, what outlines make of a profile and poses that are nearly
+    right, and seats."""
+    views, crops, poses = shots
+    outlines, rings = [crop_outline(c) for c in crops], crop_rings(crops, OUTLINE)
+    tilt = similarity(Rotation.from_rotvec([0.06, 0.0, 0.04]).as_matrix(), np.zeros(3))
+    begun = Revolved(1.05 * PROFILE, tilt @ poses, np.zeros(7))
+    body = refine_revolution(outlines, rings, begun)
     return views, crops, poses, body, seats_of(crops, body)
 
 
@@ -131,6 +153,27 @@ def wrong_by(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     turn = [t[:3, :3] @ p[:3, :3].T for p, t in zip(found, truth, strict=True)]
     off = np.array([[rotation_angle(a.T @ b) for a in turn] for b in turn])
     return off[np.median(off, 1).argmin()]
+
+
+def axes_off(found: np.ndarray, truth: np.ndarray) -> list[float]:
+    """Degrees between axes that point the same way in all, or all the other way."""
+    ways = ([off_axis(p, t, sign) for p, t in zip(found, truth, strict=True)] for sign in (1, -1))
+    return min(ways, key=sum)
+
+
+@pytest.mark.slow
+def test_bottles_are_placed_by_outlines_and_decoration_without_a_search(shots):
+    """Nothing but the views is given."""
+    views, _, truth = shots
+    said = []
+    found = instance_search.place(views, OPTIONS, say=said.append)
+    off, wrong = axes_off(found.poses, truth), wrong_by(found.poses, truth)
+    assert np.median(off) < 4 and max(off) < 12, off
+    unsure = found.having(Status.AXIS_ONLY)
+    assert found.sure and (~unsure).sum() >= 4 and (wrong[~unsure] < 20).all(), (wrong, unsure)
+    assert any("bodies of revolution" in text for text in said)
+    assert not any("grown" in text for text in said)
+    assert any("azimuths about the axis are uncertain" in text for text in said) == unsure.any()
 
 
 def test_outlines_tell_the_axes(bottles):
@@ -189,6 +232,7 @@ def test_an_axis_that_leans_the_other_way_has_nearly_the_same_outline(bottles):
     assert a.sum() > 500 and (a ^ b).sum() < 0.03 * a.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radii", [(0.8, 0.55, 0.3), (0.7, 0.7, 0.7)], ids=["lopsided", "ball"])
 def test_what_has_no_axis_is_not_sure_of_it(radii):
     """Ellipses are the outlines of a body of revolution too: what is not sure of its turns is left
@@ -257,8 +301,10 @@ def test_a_turn_about_the_axis_leaves_the_axis(bottles):
     [
         ({"a": 0.75, "b": 0.74, "c": 0.6}, {"a": 0.7, "b": 0.76}, "b", 5),
         ({"a": 0.75, "b": 0.6, "c": 0.5}, {}, "a", 3),
+        ({"a": -np.inf, "b": -np.inf}, {}, None, 2),
+        ({}, {}, None, 0),
     ],
-    ids=["close", "clear"],
+    ids=["close", "clear", "none agrees", "no answer"],
 )
 def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, long, told, asked):
     fits = []
@@ -272,95 +318,50 @@ def test_between_answers_that_come_close_longer_fits_decide(monkeypatch, short, 
         instance_revolution.most_likely_set(None, None, {name: name for name in short}, OPTIONS, 0)
         == told
     )
-    assert len(fits) == asked and max(fits) == (LONGER if long else 1) * 2 * OPTIONS.steps
+    assert len(fits) == asked
+    assert max(fits, default=2 * OPTIONS.steps) == (LONGER if long else 1) * 2 * OPTIONS.steps
 
 
-def test_without_an_answer_that_agrees_none_is_likeliest(monkeypatch):
-    monkeypatch.setattr(instance_revolution, "decoration_agreement", lambda *a: -np.inf)
-    assert (
-        instance_revolution.most_likely_set(None, None, {"a": None, "b": None}, OPTIONS, 0) is None
-    )
-    assert instance_revolution.most_likely_set(None, None, {}, OPTIONS, 0) is None
+def revolved(firm: int, **fields) -> RevolvedPlaces:
+    """Seven objects, the last `firm` of which are sure of their turn."""
+    ids = tuple(range(7))
+    poses = standing_on_a_plane(7, 0.1)
+    placed = Placed(poses, np.full(7, 0.9), ids[7 - firm :], ids[: 7 - firm], DETAILED)
+    return RevolvedPlaces(placed, **{"axes": True, "certain": True, **fields})
 
 
-def placed(bottles, told, monkeypatch, sure):
-    """(what the search finds, what it has said), of bottles some of which are sure of what
-    decoration tells."""
-    views, _, _, body, seats = bottles
-    said: list[str] = []
-    monkeypatch.setattr(
-        "relit.fit.registration.instances.revolution_search.fit_revolution", lambda *a: body
-    )
-    monkeypatch.setattr(
-        "relit.fit.registration.instances.revolution_search.seats_of", lambda *a: seats
-    )
-    monkeypatch.setattr(
-        "relit.fit.registration.instances.revolution_search.turned_by_decoration",
-        lambda *a: {"colour": AzimuthEstimate(told.poses, sure)},
-    )
-    monkeypatch.setattr(
-        instance_search,
-        "refine_and_verify",
-        lambda views, crops, rings, poses, scores, o, **_: (poses, scores, set()),
-    )
-    found = instance_search.place(views, OPTIONS, say=said.append)
-    off = min(
-        (
-            [off_axis(p, t, sign) for p, t in zip(found.poses, bottles[2], strict=True)]
-            for sign in (1, -1)
-        ),
-        key=sum,
-    )
-    assert np.median(off) < 6, off
-    return found, said
+@pytest.mark.parametrize(
+    "firm, deferred, said",
+    [
+        (7, [], ""),
+        (5, [0, 1], "2 of 7 azimuths about the axis are uncertain: deferred"),
+        (3, [], "4 of 7 azimuths about the axis are uncertain: their decoration"),
+    ],
+)
+def test_uncertain_azimuths_are_deferred_where_most_are_certain(firm, deferred, said):
+    told = []
+    found = instance_search.by_axes(revolved(firm).placed, told.append)
+    assert np.flatnonzero(found.having(Status.AXIS_ONLY)).tolist() == deferred
+    assert (said in told[0] and len(told) == 1) if said else not told
 
 
-def test_bodies_of_revolution_that_are_sure_are_not_searched(bottles, told, monkeypatch):
-    monkeypatch.setattr(
-        instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
-    )
-    found, _ = placed(bottles, told, monkeypatch, np.ones(7, bool))
-    assert found.sure
-
-
-def test_uncertain_azimuths_of_a_mostly_certain_body_of_revolution_are_deferred(
-    bottles, told, monkeypatch
+@pytest.mark.parametrize(
+    "firm, fields, searched",
+    [
+        (7, {}, False),
+        (0, {}, False),  # on one plane: sure of the axes
+        (0, {"certain": False}, True),
+    ],
+)
+def test_bodies_of_revolution_keep_their_axes_and_are_searched_where_nothing_is_certain(
+    shots, monkeypatch, firm, fields, searched
 ):
-    monkeypatch.setattr(
-        instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
-    )
-    for name in ("confirmed", "refine_and_verify"):  # which could lose the axes
-        monkeypatch.setattr(
-            instance_search, name, lambda *a, **k: pytest.fail("a search over all poses")
-        )
-    found, said = placed(bottles, told, monkeypatch, np.arange(7) > 1)
-    assert np.flatnonzero(found.having(Status.AXIS_ONLY)).tolist() == [0, 1]
-    assert any("2 of 7 azimuths" in text for text in said)
-
-
-def test_bodies_of_revolution_that_are_not_sure_keep_their_axes_where_the_search_finds_nothing(
-    bottles, told, monkeypatch
-):
-    asked = []
-    monkeypatch.setattr(instance_search, "pair_guesses", lambda *a, **k: asked.append(1) or {})
-    monkeypatch.setattr(
-        "relit.fit.registration.instances.revolution_search.lies_on_plane", lambda poses: False
-    )
-    _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
-    assert asked and any("7 of 7 are not sure" in text for text in said)
-
-
-def test_bodies_of_revolution_on_one_plane_are_not_searched_whether_they_are_sure_or_not(
-    bottles, told, monkeypatch
-):
-    monkeypatch.setattr(
-        instance_search, "pair_guesses", lambda *a, **k: pytest.fail("a search over all poses")
-    )
-    monkeypatch.setattr(
-        "relit.fit.registration.instances.revolution_search.lies_on_plane", lambda poses: True
-    )
-    _, said = placed(bottles, told, monkeypatch, np.zeros(7, bool))
-    assert any("7 of 7 are not sure" in text for text in said)
+    """With a search that finds nothing."""
+    told, asked = revolved(firm, **fields), []
+    monkeypatch.setattr(instance_search, "place_revolved", lambda *_, **__: told)
+    monkeypatch.setattr(instance_search, "grown_from_pairs", lambda *_, **__: asked.append(1))
+    found = instance_search.place(shots[0], OPTIONS)
+    assert np.array_equal(found.poses, told.placed.poses) and bool(asked) == searched
 
 
 def standing_on_a_plane(count: int, off: float) -> np.ndarray:

@@ -216,24 +216,33 @@ def test_solids_of_single_photos_find_their_neighbours():
     ("photos", "held", "begins"), [(14, 8, "set"), (14, 4, "photo"), (9, 8, "photo")]
 )
 def test_growth_begins_from_pairs_where_they_hold_enough(monkeypatch, photos, held, begins):
+    """Each of the first `held` photos finds the next two as they stand."""
     from relit.fit.registration.photos import growth
+    from relit.fit.registration.photos.pairs import RelativePose
+    from relit.fit.registration.register import crop_photo
 
-    asked, grown = [], []
-    monkeypatch.setattr(growth, "crop_rings", lambda *_: None)
-    monkeypatch.setattr(growth, "pairs_of", lambda *_: asked.append(1))
-    monkeypatch.setattr(
-        growth, "largest_consistent_set", lambda *_: {k: np.eye(3) for k in range(held)}
-    )
-    monkeypatch.setattr(growth, "placed_towards", lambda crop, rotation: np.eye(4))
-    monkeypatch.setattr(growth, "start_photos", lambda *_: [0])
+    shots = photos_in_front([[0.3, 0.5, 3.0], [-0.6, 0.3, 3.0]], np.random.default_rng(0))
+    crops, asked, grown = ([crop_photo(*p) for p in shots] * 7)[:photos], [], []
+    pairs = [
+        RelativePose(0.9, i, j, exp_so3(np.array([0, 0.3 * (j - i), 0])))
+        for i in range(held)
+        for j in (i + 1, i + 2)
+        if j < held
+    ]
     done = (np.tile(np.eye(4), (photos, 1, 1)), np.full(photos, 0.9))
+    monkeypatch.setattr(growth, "pairs_of", lambda *_: asked.append(1) or pairs)
     monkeypatch.setattr(
-        growth, "grow_set", lambda crops, poses, used, *_: grown.append(("set", used)) or done
+        growth,
+        "grow_set",
+        lambda crops, poses, used, *_: grown.append(("set", used, poses)) or done,
     )
-    monkeypatch.setattr(growth, "grow_photos", lambda *_: grown.append(("photo", None)) or done)
+    monkeypatch.setattr(growth, "grow_photos", lambda *_: grown.append(("photo",)) or done)
     monkeypatch.setattr(growth, "settle_photos", lambda *_: done)
     said = []
-    growth.poses_by_growth([None] * photos, 1, 1, 0, said.append)
+    growth.poses_by_growth(crops, 1, 1, 0, said.append)
     assert grown[0][0] == begins and bool(asked) == (photos >= 12)
     if begins == "set":
-        assert grown == [("set", list(range(8)))] and said == ["pairs hold 8 of 14 photos together"]
+        ((_, used, poses),) = grown
+        assert used == list(range(8)) and said == ["pairs hold 8 of 14 photos together"]
+        between = poses[0, :3, :3].T @ poses[7, :3, :3]
+        assert rotation_angle(between) == pytest.approx(np.degrees(2.1), abs=1)
