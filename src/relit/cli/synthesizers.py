@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from relit.cli.parser import KINDS, Kind, Parser, device_flag, out_flag
+from relit.cli.parser import Kind, Parser, device_flag, out_flag
+from relit.cli.photographed import PHOTOGRAPHED, delivery_flags, delivery_of
 from relit.errors import EXIT_USAGE, UserError
 
 
@@ -15,7 +16,7 @@ def synthesize_flags(parser: Parser) -> None:
     """Flags of every kind."""
     parser.add_argument(
         "kind",
-        choices=KINDS,
+        choices=tuple(SYNTHESIZERS),
         help="kind of capture; see its own --help",
     )
     add = parser.common.add_argument
@@ -93,6 +94,7 @@ def multiview_flags(parser: Parser) -> None:
         help="renderer of the truth: relit (default), mitsuba (principled) or cycles (Blender)",
     )
     sampling_flags(parser, views=60, test_views=12, resolution=400, spp=64, test_spp=256)
+    delivery_flags(parser)
 
 
 def multiview(args) -> None:
@@ -121,6 +123,7 @@ def multiview(args) -> None:
         renderer=args.renderer,
         roughness=args.roughness,
         metallic=args.metallic,
+        delivery=delivery_of(args),
         say=Log().say,
     )
 
@@ -319,4 +322,5 @@ SYNTHESIZERS: dict[str, Kind] = {
     "flash": Kind(flash_flags, flash),
     "collection": Kind(collection_flags, collection),
     "duplicates": Kind(duplicates_flags, duplicates),
+    **PHOTOGRAPHED,
 }

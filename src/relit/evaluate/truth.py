@@ -75,29 +75,31 @@ def load_truth(folder: str | Path) -> Truth:
         )
     meta = read_bounded_json(file)
     size = meta["settings"]["resolution"]
-    train, test = (
-        _read_cameras(folder / f"transforms_{split}.json", size) for split in ("train", "test")
-    )
+    train, test = (_read_cameras(_cameras_file(folder, split), size) for split in ("train", "test"))
     return Truth(folder, train, test, float(meta["sphere"]["radius"]), meta)
+
+
+def _cameras_file(folder: Path, split: str) -> Path:
+    """The true cameras: those of truth/ where a capture hands over others, or none."""
+    hidden = folder / "truth" / f"transforms_{split}.json"
+    return hidden if hidden.is_file() else folder / f"transforms_{split}.json"
 
 
 def _read_cameras(file: Path, size: int) -> dict[str, Camera]:
     from relit.asset.asset import read_bounded_json
 
     content = read_bounded_json(file)
-    focal = size / (2 * np.tan(content["camera_angle_x"] / 2))
-    return {
-        camera_key(f["file_path"]): Camera(
-            size,
-            size,
-            focal,
-            focal,
-            size / 2,
-            size / 2,
-            world_from_cv_camera(np.array(f["transform_matrix"], np.float64)),
-        )
-        for f in content["frames"]
-    }
+    return {camera_key(f["file_path"]): _camera({**content, **f}, size) for f in content["frames"]}
+
+
+def _camera(entry: dict[str, Any], size: int) -> Camera:
+    """The pinhole of a frame: with its own intrinsics, else a square of `size` pixels."""
+    pose = world_from_cv_camera(np.array(entry["transform_matrix"], np.float64))
+    if "fl_x" in entry:
+        inner = (float(entry[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
+        return Camera(int(entry["w"]), int(entry["h"]), *inner, pose)
+    focal = size / (2 * np.tan(entry["camera_angle_x"] / 2))
+    return Camera(size, size, focal, focal, size / 2, size / 2, pose)
 
 
 def camera_key(name: str) -> str:

@@ -40,6 +40,15 @@ from relit.files import write_text
 from relit.geometry.se3 import look_at
 from relit.scene import Camera, Material, Mesh
 from relit.synthesize.ceiling import ceilings
+from relit.synthesize.delivery import (
+    Delivery,
+    delivered_shots,
+    delivery_truth,
+    in_front_of,
+    pinholes,
+    write_cameras,
+    write_photo,
+)
 from relit.synthesize.renderers import (
     TrueObject,
     TruthScene,
@@ -75,6 +84,7 @@ def synthesize_multiview(
     roughness: float | None = None,
     metallic: float | None = None,
     max_depth: int | None = None,
+    delivery: Delivery | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Path:
     """Render a multi-view capture of one object under one light, with its truth, into `out`;
@@ -85,6 +95,9 @@ def synthesize_multiview(
     against. roughness, metallic: replace the file's maps by a constant (an OBJ has none).
     renderer: one of `synthesize.renderers.RENDERERS`. max_depth: longest path in edges (2 = direct
     light only), None for what the renderer usually has.
+
+    delivery: None for the layout above (ideal photos with alpha); else training photos, masks and
+    cameras are those of `synthesize.delivery`, with the light in view behind the object.
 
     Deterministic by `seed`. A call with the same settings takes up where a killed one stopped and
     returns at once when all is there.
@@ -112,6 +125,7 @@ def synthesize_multiview(
         roughness=roughness,
         metallic=metallic,
         max_depth=max_depth,
+        **({} if delivery is None else {"delivery": delivery.settings()}),
     )
     if not (out / "truth" / "truth.json").exists():
         require_renderer(renderer)  # before anything is written
@@ -127,9 +141,14 @@ def synthesize_multiview(
     train = orbit_cameras(views, resolution, seed=seed, prefix="train/r_")
     test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="test/t_")
     truth = out / "truth"
+    shots = [] if delivery is None else delivered_shots(delivery, train, seed)
+    train = pinholes(shots) or train
     write_mesh(truth / "mesh.ply", mesh, thing.world_from_asset)
-    _write_transforms(out / "transforms_train.json", train, resolution)
-    _write_transforms(out / "transforms_test.json", test, resolution)
+    if delivery is None:
+        _write_transforms(out / "transforms_train.json", train, resolution)
+        _write_transforms(out / "transforms_test.json", test, resolution)
+    else:
+        write_cameras(out, delivery, shots, test)
 
     def lit(file: Path) -> tuple[TruthScene, np.ndarray]:
         """Scene under a light whose exposure fits the object, and that light."""
@@ -141,10 +160,20 @@ def synthesize_multiview(
         train[i][0]
         for i in np.unique(np.linspace(0, views - 1, min(SCALE_VIEWS, views)).round().astype(int))
     ]
+    light = environment
+
+    def take(camera: Camera, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        return in_front_of(light, camera, radiance(scene, camera, samples, max_depth, seed))
+
     for i, (name, camera) in enumerate(train):
-        write_training_view(
-            out, scene, name, camera, spp, max_depth, seed * 1_000_003 + i, name in scale_names
-        )
+        if delivery is None:
+            write_training_view(
+                out, scene, name, camera, spp, max_depth, seed * 1_000_003 + i, name in scale_names
+            )
+        else:
+            write_photo(out, delivery, name, shots[i][1], take, spp)
+            if name in scale_names:
+                write_scale_view(out, scene, name, camera)
         tell_progress(say, "training photo", i, views)
     for i, (name, camera) in enumerate(test):
         write_test_view(
@@ -193,6 +222,7 @@ def synthesize_multiview(
             "test": [name for name, _ in test],
             "train_albedo": [Path(n).name for n in scale_names],
             "relight": [file.stem for file in relights],
+            **delivery_truth(out, delivery, shots),
         },
     )
     return out
@@ -298,8 +328,14 @@ def write_training_view(
     photo = out / f"{name}.png"
     if not photo.exists():
         _write_rgba(photo, radiance(scene, camera, spp, max_depth, seed))
+    if albedo:
+        write_scale_view(out, scene, name, camera)
+
+
+def write_scale_view(out: Path, scene, name: str, camera: Camera) -> None:
+    """The base colour of a training view in truth/train_albedo, unless it is there."""
     target = out / "truth" / "train_albedo" / f"{Path(name).name}.exr"
-    if albedo and not target.exists():
+    if not target.exists():
         from relit.images import write_linear
         from relit.reference.mitsuba_scene import render_channels
 
@@ -390,9 +426,11 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
     plain = {
         key: options.get(key, value)
         for key, value in defaults.items()
-        if key not in ("relights", "say")
+        if key not in ("relights", "say", "delivery")
     }
     plain["max_depth"] = depth_of(plain["renderer"], plain["max_depth"])
+    if "delivery" in options:
+        plain["delivery"] = options["delivery"]
     digests = {what: identity_of(file) for what, file in files.items()}
     return {
         "version": VERSION,
