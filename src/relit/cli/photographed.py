@@ -69,7 +69,7 @@ def _staged_flags(parser: Parser, views: int, camera: str) -> None:
     add("--views", type=int, default=views, help=f"photos (default {views})")
     add("--test-views", type=int, default=8, help="test views of the object alone (default 8)")
     more("--resolution", type=int, default=400, help="pixels of the longer side (default 400)")
-    more("--spp", type=int, default=64, help="samples per pixel of photos (default 64)")
+    more("--spp", type=int, default=128, help="samples per pixel of photos (default 128)")
     more("--test-spp", type=int, default=192, help="samples per pixel of test views (default 192)")
     _model_flags(parser, camera)
     more("--masks", action="store_true", help="write masks beside the photos")

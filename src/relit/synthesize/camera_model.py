@@ -135,7 +135,8 @@ class CameraModel:
         return ".jpg" if self.jpeg else ".png"
 
 
-# Shot noise: a full well of 6000 electrons. Read noise: 2 electrons of it. Mean .18: a grey card.
+# Shot noise: a full well of 6000 electrons. Read noise: 2 electrons of it. Mean .15: below a
+# grey card, as phones spare highlights.
 PRESETS = {
     "off": CameraModel(),
     "phone": CameraModel(
@@ -145,7 +146,7 @@ PRESETS = {
         motion=1.0,
         partial=0.1,
         crops=0.15,
-        auto_exposure=0.18,
+        auto_exposure=0.15,
         exposure=0.1,
         white_balance=0.05,
         shot_noise=1 / 6000,

@@ -35,13 +35,13 @@ from relit.synthesize.object_truth import (
 )
 from relit.synthesize.surroundings import Support, staged, table_texture
 
-EVERYDAY_SAMPLING = Sampling(views=40, test_views=8, resolution=400, spp=64, test_spp=192)
+EVERYDAY_SAMPLING = Sampling(views=40, test_views=8, resolution=400, spp=128, test_spp=192)
 EVERYDAY = Delivery(PRESETS["phone"], masks=False, cameras=False)
 FOCAL = 27.0  # mm, 35 mm equivalent of a phone's main camera
 ASPECT = 0.75
 PORTRAIT = 0.4  # share of photos
 RINGS = ((12.0, 22.0), (28.0, 42.0), (50.0, 65.0))  # degrees of elevation, by turns
-FILL = (0.5, 0.8)  # of half the shorter side, by the object's sphere
+FILL = (0.65, 0.95)  # of half the shorter side, by the object's sphere
 ROLL, AIM = 6.0, 0.06  # degrees; share of the shorter side, standard deviations
 TABLE = 4.0 * RADIUS  # half a side: its far edge is in view in low photos
 BACKGROUND_BLUR = 1.0  # degrees, by which what is behind is out of focus

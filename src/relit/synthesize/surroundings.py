@@ -23,7 +23,7 @@ ROUGHNESS = {"wood": 0.45, "cloth": 0.9, "speckle": 0.6}
 FILE_ROUGHNESS = 0.6  # of a supplied picture
 PLANK_COUNT = 7  # over the table
 MAX_DEPTH = 10  # edges of the longest path, as `--renderer mitsuba`
-DISC_SIZE = 1024  # pixels a side of a plate's outline
+DISC_SIZE = 1024  # texels along the radius of a plate
 COVERAGE_SAMPLES = 16  # rays a pixel of the object's coverage
 
 
@@ -170,23 +170,38 @@ def support_plugin(support: Support, unit_from_world: np.ndarray) -> dict[str, A
     pose = np.eye(4)
     pose[:3, :3] = turn @ lay
     pose[:3, 3] = (0, support.height, 0)
-    bsdf: dict[str, Any] = {
+    disc = support.shape == "disc"
+    colour = polar_texture(support.colour) if disc else support.colour
+    bsdf = {
         "type": "twosided",
         "bsdf": {
             "type": "principled",
-            "base_color": mitsuba_texture(support.colour, color=True),
+            "base_color": mitsuba_texture(colour, color=True),
             "roughness": float(support.roughness),
         },
     }
-    if support.shape == "disc":
-        a = (np.arange(DISC_SIZE) + 0.5) / DISC_SIZE * 2 - 1
-        inside = (a[None] ** 2 + a[:, None] ** 2 < 1).astype(np.float32)
-        bsdf = {"type": "mask", "opacity": mitsuba_texture(inside), "bsdf": bsdf}
     return {
-        "type": "rectangle",
+        "type": "disk" if disc else "rectangle",
         "to_world": mi.ScalarTransform4f(np.asarray(unit_from_world) @ pose),
         "bsdf": bsdf,
     }
+
+
+def polar_texture(colour: np.ndarray) -> np.ndarray:
+    """(H, W, 3) texture of Mitsuba's disk, u = radius and v = angle, that shows the square texture
+    `colour` flat. A mask over a rectangle would block shadow rays."""
+    h, w = colour.shape[:2]
+    radius = (np.arange(DISC_SIZE) + 0.5) / DISC_SIZE
+    angle = (np.arange(2 * DISC_SIZE) + 0.5) / (2 * DISC_SIZE) * 2 * np.pi
+    x = (radius * np.cos(angle[:, None]) + 1) / 2 * w - 0.5
+    y = (radius * np.sin(angle[:, None]) + 1) / 2 * h - 0.5
+    return cv2.remap(
+        np.asarray(colour, np.float32),
+        x.astype(np.float32),
+        y.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
 
 
 def out_of_focus(environment: np.ndarray, degrees: float) -> np.ndarray:

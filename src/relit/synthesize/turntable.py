@@ -39,12 +39,12 @@ from relit.synthesize.object_truth import (
 )
 from relit.synthesize.surroundings import Support, staged, table_texture
 
-TURNTABLE_SAMPLING = Sampling(views=36, test_views=8, resolution=400, spp=64, test_spp=192)
+TURNTABLE_SAMPLING = Sampling(views=36, test_views=8, resolution=400, spp=128, test_spp=192)
 # A camera on a tripod with everything set by hand.
 TURNTABLE = Delivery(CameraModel(jpeg=95, exif=True, shot_noise=1 / 12000), cameras=False)
 ELEVATIONS = (25.0,)  # degrees; each is one turn of the plate
 FIELD = 32.0  # degrees along the longer side
-FILL = 0.75  # of half the shorter side, by the object's sphere
+FILL = 0.9  # of half the shorter side, by the object's sphere
 PLATE = 1.15 * RADIUS
 PLATE_HEIGHT = 0.06 * RADIUS  # of the plate above the table
 TABLE = 4.0 * RADIUS
