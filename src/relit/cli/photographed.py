@@ -21,13 +21,13 @@ def _model_flags(parser: Parser, default: str) -> None:
         "--camera-model",
         metavar="MODEL",
         default=None,
-        help=f"off, phone, key=value,... or phone,key=value,... (default {default})",
+        help=f"phone, key=value,... or phone,key=value,... (default {default})",
     )
     parser.more.add_argument(
         "--mask-errors",
         metavar="ERRORS",
         default=None,
-        help="off, segmenter, key=value,... or segmenter,key=value,... (default off)",
+        help="segmenter, key=value,... or segmenter,key=value,... (default off)",
     )
 
 
@@ -118,7 +118,7 @@ def everyday(args) -> None:
 
 
 def turntable_flags(parser: Parser) -> None:
-    _staged_flags(parser, 36, "a still camera, JPEG")
+    _staged_flags(parser, 36, "still, JPEG")
     parser.more.add_argument(
         "--elevations",
         type=float,

@@ -17,7 +17,7 @@ def synthesize_flags(parser: Parser) -> None:
     parser.add_argument(
         "kind",
         choices=tuple(SYNTHESIZERS),
-        help="kind of capture; see its own --help",
+        help=f"{', '.join(SYNTHESIZERS)}: each has its own --help",
     )
     add = parser.common.add_argument
     add(
