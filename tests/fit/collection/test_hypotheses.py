@@ -61,7 +61,7 @@ def group_at(poses) -> Group:
     return Group(np.arange(count), np.array(poses), focals, np.zeros((0, 3)), np.zeros(0, int))
 
 
-OPTIONS = CollectionOptions(rounds=3, keep=1, polish=1)
+OPTIONS = CollectionOptions(rounds=2, keep=1, polish=0)
 
 
 def found(photos, group, folder):
@@ -70,6 +70,7 @@ def found(photos, group, folder):
         return poses, (run.folder / "log.txt").read_text()
 
 
+@pytest.mark.slow
 def test_wrong_links_do_not_win_against_the_search(photos, tmp_path):
     shots, truth = photos
     wrong = truth.copy()  # every other photo turned about the object, as where sides look alike
@@ -79,6 +80,7 @@ def test_wrong_links_do_not_win_against_the_search(photos, tmp_path):
     assert np.median(camera_errors(best.poses, truth)[0]) < 12, said
 
 
+@pytest.mark.slow
 def test_right_links_are_kept(photos, tmp_path):
     shots, truth = photos
     best, said = found(shots, group_at(truth), tmp_path / "run")

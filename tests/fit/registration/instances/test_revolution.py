@@ -364,6 +364,31 @@ def test_bodies_of_revolution_keep_their_axes_and_are_searched_where_nothing_is_
     assert np.array_equal(found.poses, told.placed.poses) and bool(asked) == searched
 
 
+@pytest.mark.parametrize("right", [True, False])
+def test_turns_of_matches_and_of_axes_are_compared(shots, right):
+    """Guessed turns do not replace matches that decoration bears out; wrong matches do not replace
+    right turns. Outlines are the same in both."""
+    views, crops, poses = shots[:3]
+    about_axis = [
+        similarity(Rotation.from_rotvec([0, a, 0]).as_matrix(), np.zeros(3))
+        for a in np.random.default_rng(2).uniform(0.8, 5.5, len(poses))
+    ]
+    wrong = np.array([turn @ p for p, turn in zip(poses, about_axis, strict=True)])
+    linked, guessed = (poses, wrong) if right else (wrong, poses)
+    links = [
+        (i, j, linked[j][:3, :3].T @ linked[i][:3, :3])
+        for i in range(len(poses))
+        for j in range(i + 1, len(poses))
+    ]
+    revolved = Placed(guessed, np.ones(len(poses)), (), tuple(range(len(poses))), DETAILED)
+    said: list[str] = []
+    found = instance_search.better_by_matches(
+        views, crops, revolved, OPTIONS, seed=0, links=links, say=said.append
+    )
+    assert (found is not None) == right, said
+    assert f"those by {'matches' if right else 'axes'} are kept" in said[0]
+
+
 def standing_on_a_plane(count: int, off: float) -> np.ndarray:
     """Poses (count, 4, 4) of objects in any turn whose middles lie on a plane that leans, but for
     `off` along the line of sight."""

@@ -681,11 +681,11 @@ def test_poses_of_a_ball_are_ambiguous_and_those_of_a_painted_body_are_not():
 def test_distances_are_held_once_asked_to_and_nothing_else_is():
     from types import SimpleNamespace
 
-    bank, model = SimpleNamespace(views=3), SimpleNamespace(extra={})
+    bank, model = SimpleNamespace(views=3), SimpleNamespace()
     move_poses(bank, model)
-    before = np.array(model.extra["correction_rates"]).reshape(3, 8)
+    before = np.array(model.correction_ratios).reshape(3, 8)
     hold_distances(model)
-    after = np.array(model.extra["correction_rates"]).reshape(3, 8)
+    after = np.array(model.correction_ratios).reshape(3, 8)
     assert (
         (before[:, 7] == 1).all()
         and (after[:, 7] == 0).all()

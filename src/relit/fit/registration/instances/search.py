@@ -16,6 +16,8 @@ coherent_turns  as up_to_turns, of the final poses
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from relit.fit.registration.instances.growth import grow_instances
@@ -34,7 +36,12 @@ from relit.fit.registration.instances.regrowth import (
     mostly_firm,
     score_growth,
 )
-from relit.fit.registration.instances.revolution_search import mostly_sure, place_revolved
+from relit.fit.registration.instances.revolution_search import (
+    LONGER,
+    decoration_agreement,
+    mostly_sure,
+    place_revolved,
+)
 from relit.fit.registration.instances.rounds import refine_and_verify, refine_jointly
 from relit.fit.registration.instances.views import (
     InstanceView,
@@ -126,6 +133,12 @@ def place(
     crops = instance_crops(views)
     best: Placed | None = None
     revolved = place_revolved(views, crops, o, seed=seed, say=say)
+    if revolved is not None and links:
+        matched = better_by_matches(
+            views, crops, revolved.placed, o, seed=seed, links=links, say=say
+        )
+        if matched is not None:
+            return verified(views, crops, matched, o, True, seed=seed, say=say)[0]
     if revolved is not None and revolved.certain and mostly_sure(revolved.placed):
         return by_axes(revolved.placed, say)
     if revolved is not None:
@@ -158,31 +171,81 @@ def place(
     if not believed(best, o):
         doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
         say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
+    found, rings = verified(views, crops, best, o, believed(best, o), seed=seed, say=say)
+    if len(views) > 3:
+        detailed = crop_rings(crops, DETAILED)
+        turned = coherent_turns(views, crops, detailed, found.poses, o, seed=seed + 70, say=say)
+        if turned is not None:
+            poses, scores = refine_jointly(
+                views,
+                crops,
+                rings,
+                turned.poses,
+                turned.own,
+                o,
+                seed=seed + 80,
+                parts=best.parts,
+                say=say,
+            )
+            return replace(found, poses=poses, scores=scores)
+    return found
+
+
+def verified(
+    views: list[InstanceView],
+    crops,
+    best: Placed,
+    o: Search,
+    sure: bool,
+    *,
+    seed: int,
+    say=lambda text: None,
+) -> tuple[Placements, Rings]:
+    """The set after rounds of a model of all and a search by rendering it, with contested instances
+    deferred where they can be spared; and the descriptors of the crops. sure: see `Placements`."""
     rings = crop_rings(crops, best.parts)
-    poses, scores, torn = refine_and_verify(
+    poses, scores, contested = refine_and_verify(
         views, crops, rings, best.poses, best.own, o, seed=seed, parts=best.parts, say=say
     )
-    turned = (
-        coherent_turns(views, crops, crop_rings(crops, DETAILED), poses, o, seed=seed + 70, say=say)
-        if len(views) > 3
-        else None
+    found = all_placed(poses, scores, sure)
+    found.status[deferred_until_the_end(views, contested, say)] = Status.CONTESTED
+    return found, rings
+
+
+def better_by_matches(
+    views: list[InstanceView], crops, revolved: Placed, o: Search, *, seed: int, links, say
+) -> Placed | None:
+    """What grows from the largest set of instances that matches hold together, where their
+    decoration agrees better in it than in `revolved`; None where it does not, or matches hold
+    together fewer than half. Outlines agree in every turn about the axis, so that decoration alone
+    decides (`decoration_agreement`)."""
+    members, poses = max(
+        linked_sets(views, links, frame_scale(views)),
+        key=lambda one: len(one[0]),
+        default=([], None),
     )
-    if turned is not None:
-        poses, scores = refine_jointly(
-            views,
-            crops,
-            rings,
-            turned.poses,
-            turned.own,
-            o,
-            seed=seed + 80,
-            parts=best.parts,
-            say=say,
+    if poses is None or len(members) < max(3, len(views) / 2):
+        return None
+    rings = crop_rings(crops, DETAILED)
+    try:
+        grown = grow_instances(
+            views, crops, rings, DETAILED, members, poses, o.growth, seed=seed, links=links
         )
-    found = all_placed(poses, scores, believed(best, o))
-    deferred = deferred_until_the_end(views, torn, say)
-    found.status[deferred] = Status.CONTESTED
-    return found
+    except NoShape:
+        return None
+    placed = score_growth(views, grown, DETAILED, o, seed)
+    if placed is None:
+        return None
+    steps = LONGER * 2 * o.steps
+    by_matches, by_axes = (
+        decoration_agreement(views, crops, one.poses, o, seed, steps) for one in (placed, revolved)
+    )
+    kept = "matches" if by_matches > by_axes else "axes"
+    say(
+        f"turns by matches of {len(members)} of {len(views)} and by axes: their decoration agrees by {by_matches:.3f} and {by_axes:.3f}; "
+        f"those by {kept} are kept"
+    )
+    return placed if by_matches > by_axes else None
 
 
 def deferred_until_the_end(views: list[InstanceView], contested: set[int], say) -> list[int]:
