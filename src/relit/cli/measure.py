@@ -18,7 +18,11 @@ def evaluate_flags(parser: Parser) -> None:
     parser.common.add_argument(
         "--json", type=Path, default=None, metavar="FILE", help="write the figures there"
     )
+    protocol = "how to measure: relit, or as a paper's released code: sfd, pir, samurai, orb"
+    parser.common.add_argument("--protocol", default="relit", metavar="NAME", help=protocol)
     device_flag(parser)
+    network = "also LPIPS, by this network (two pictures in, one number out); needs onnxruntime"
+    parser.more.add_argument("--lpips", type=Path, default=None, metavar="FILE.onnx", help=network)
     parser.more.add_argument(
         "--spp",
         type=int,
@@ -34,7 +38,7 @@ def do_evaluate(args) -> None:
     from relit.files import write_text
 
     use_device(args.device)
-    result = evaluate(args.run, args.truth, spp=args.spp)
+    result = evaluate(args.run, args.truth, spp=args.spp, protocol=args.protocol, lpips=args.lpips)
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         write_text(args.json, json.dumps(result, indent=1) + "\n")

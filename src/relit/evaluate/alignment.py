@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from relit.conventions import move_pose, rotate_environment, scale_of
+from relit.conventions import move_points, move_pose, rotate_environment, scale_of
 from relit.errors import UserError
 from relit.geometry import se3
 from relit.scene import Asset, Camera, Flash
@@ -32,6 +32,25 @@ def align_points(source, target, with_scale: bool = True) -> np.ndarray:
             "the matched points lie on a line", "the rotation around that line is not determined"
         )
     return se3.umeyama(x, y, with_scale)
+
+
+def align_centres(source, target, robust: bool = True) -> np.ndarray:
+    """target_from_source (4, 4) similarity of matched camera CENTRES (N, 3) alone (Procrustes, as
+    BARF and SAMURAI), so that orientations can be scored that the fit has not used.
+
+    robust: fit again without the centres that are more than 3 medians off; the papers use all.
+    Raises UserError where the centres lie on a line, which leaves a rotation open.
+    """
+    x, y = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    keep = np.ones(len(x), bool)
+    similarity = align_points(x, y)
+    for _ in range(3 if robust else 0):
+        off = np.linalg.norm(move_points(similarity, x) - y, axis=1)
+        keep = off <= max(3 * float(np.median(off)), 1e-9 * float(np.ptp(y)))
+        if keep.sum() < 3:
+            break
+        similarity = align_points(x[keep], y[keep])
+    return similarity
 
 
 def align_named_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) -> np.ndarray:
@@ -68,6 +87,28 @@ def align_named_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) 
 def angle_between(a, b) -> float:
     """Angle in degrees between two rotations (3, 3)."""
     return se3.rotation_angle(np.asarray(a, np.float64).T @ np.asarray(b, np.float64))
+
+
+def angles_between(a, b) -> np.ndarray:
+    """Angles (...) in degrees between rotations (..., 3, 3), broadcast against each other."""
+    r = np.swapaxes(np.asarray(a, np.float64), -1, -2) @ np.asarray(b, np.float64)
+    off = np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
+    )
+    trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
+    # atan2 of twice the sine and twice the cosine: precise near 0, where arccos is not
+    return np.degrees(np.arctan2(np.linalg.norm(off, axis=-1), trace - 1))
+
+
+def turned_about(centre, cameras: dict[str, Camera], rotations: np.ndarray) -> dict[str, Camera]:
+    """Each camera turned about a point (3,) by its rotation of (N, 3, 3): distance and aim stay."""
+    out = {}
+    for (name, camera), turn in zip(cameras.items(), rotations, strict=True):
+        motion = np.eye(4)
+        motion[:3, :3] = turn
+        motion[:3, 3] = np.asarray(centre) - turn @ np.asarray(centre)
+        out[name] = camera.with_pose(motion @ camera.world_from_camera)
+    return out
 
 
 def pose_errors(

@@ -13,27 +13,42 @@ from typing import Any
 
 import numpy as np
 
-from relit.conventions import move_points, move_pose, similarity
+from relit.conventions import move_points, similarity
 from relit.errors import UserError
-from relit.evaluate import definitions
+from relit.evaluate import definitions as common
 from relit.evaluate import metrics as m
-from relit.evaluate.multiview import fixed_albedo_scale, material_figures
+from relit.evaluate.alignment import align_centres, angles_between, turned_about
+from relit.evaluate.baselines import Baselines, Constants, chance, random_rotations
+from relit.evaluate.lpips import Lpips
+from relit.evaluate.multiview import fixed_albedo_scale, material_figures, relit_figures
+from relit.evaluate.picture_figures import Draw
 from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
 from relit.evaluate.truth import Truth, camera_key
-from relit.geometry.se3 import align_cameras as align_poses
-from relit.geometry.se3 import camera_errors, nearest_rotation, rotation_angle, umeyama
+from relit.geometry.se3 import align_cameras, nearest_rotation, umeyama
 from relit.scene import Asset, Camera
 
 WITHIN = 10.0  # degrees
-_POSE = "after the best similarity between recovered and true training cameras (Procrustes, without those more than 3 medians off)"
+LOST = 180.0  # degrees: the rotation error of a training photo without a camera
+_POSE = (
+    "after the best similarity between the CENTRES of recovered and true training cameras "
+    "(Procrustes, without those more than 3 medians off), which sees no orientation"
+)
 _HELD = "held-out photos from the camera and under the light that were fitted to them with shape and material frozen"
+_WHITE = "sRGB pictures composite on white, each by its own coverage, whole frame"
 DEFINITIONS = {
-    "rotation_mean": ("degrees", f"mean rotation error of the training cameras, {_POSE}"),
-    "rotation_median": ("degrees", f"median rotation error of the training cameras, {_POSE}"),
+    "cameras": ("%", "share of the training photos that have a camera"),
+    "rotation_mean": (
+        "degrees",
+        f"mean rotation error of the training cameras that were found, {_POSE}",
+    ),
+    "rotation_median": (
+        "degrees",
+        f"median rotation error over ALL training photos, one without a camera counts {LOST:g} degrees, {_POSE}",
+    ),
     "rotation_within_10": (
         "%",
-        f"share of training cameras whose rotation error is below {WITHIN:g} degrees, {_POSE}",
+        f"share of all training photos whose camera's rotation error is below {WITHIN:g} degrees, {_POSE}",
     ),
     "translation_percent": (
         "%",
@@ -41,14 +56,16 @@ DEFINITIONS = {
     ),
     "focal_percent": ("%", "mean error of the focal lengths of the training cameras"),
     "held_out_rotation": ("degrees", f"mean rotation error of the held-out cameras, {_POSE}"),
-    "novel_psnr": (
-        "dB",
-        f"{_HELD}: PSNR of sRGB pictures composite on white, each by its own coverage, whole frame (Neural-PIL, SAMURAI)",
-    ),
-    "novel_ssim": ("", f"{_HELD}: SSIM (11 x 11, sigma 1.5), composite on white, whole frame"),
+    "novel_psnr": ("dB", f"{_HELD}: PSNR of {_WHITE}"),
+    "novel_ssim": ("", f"{_HELD}: SSIM (Gaussian 11 x 11, sigma 1.5) of {_WHITE}"),
+    "novel_lpips": ("", f"{_HELD}: LPIPS by the network of --lpips of {_WHITE}"),
     "novel_psnr_masked": (
         "dB",
         f"{_HELD}: PSNR of sRGB pictures over pixels with true coverage >= {m.MASK}",
+    ),
+    "novel_ssim_masked": (
+        "",
+        f"{_HELD}: the SSIM map of sRGB pictures on white, over pixels with true coverage >= {m.MASK}",
     ),
     "novel_mask_iou": ("", f"{_HELD}: intersection over union of the coverages, both >= .5"),
 }
@@ -75,50 +92,78 @@ def load_collection_truth(folder: str | Path) -> Truth:
 
 
 def evaluate_collection(
-    run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0
+    run_or_asset: str | Path,
+    truth_folder: str | Path,
+    *,
+    spp: int = 256,
+    seed: int = 0,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """Every figure of the module. Call `relit.device.use_device` first. Returns as
     `dispatch.evaluate`."""
     from relit.asset.asset import load_asset
 
     truth, asset = load_collection_truth(truth_folder), load_asset(run_or_asset)
-    return evaluate_collection_asset(asset, truth, spp=spp, seed=seed)
+    return evaluate_collection_asset(asset, truth, spp=spp, seed=seed, lpips=lpips)
 
 
 def evaluate_collection_asset(
-    asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0
+    asset: Asset, truth: Truth, *, spp: int = 256, seed: int = 0, lpips: Lpips | None = None
 ) -> dict[str, Any]:
     """As `evaluate_collection`, for an asset in memory."""
     from relit.reference.mitsuba_scene import build_scene
 
-    check_lights(asset)
-    found = {
-        camera_key(name): (camera, light)
-        for (name, camera), light in zip(asset.cameras, asset.lights, strict=True)
-    }
-    values, world_from_found, per_view = camera_pose_figures(
-        {n: c for n, (c, _) in found.items()}, truth.train, truth.test
-    )
+    draw, constants = Draw(spp, seed, lpips), Constants()
+    found = cameras_and_lights(asset)
+    cameras = {n: c for n, (c, _) in found.items()}
+    values, per_view = camera_pose_figures(cameras, truth.train, truth.test)
+    baselines = camera_chance(cameras, truth.train, truth.test)
     for i, name in enumerate(n for n in truth.test if n in found):
         per_view.setdefault(name, {}).update(
-            picture_figures(asset, *found[name], truth.picture(f"test/{name}"), spp, seed + i)
+            picture_figures_on_white(
+                asset, *found[name], truth.picture(f"test/{name}"), replace(draw, seed=seed + i)
+            )
         )
-    placed = replace(asset, world_from_asset=onto_surface(asset, world_from_found, truth))
+    names = [n for n in truth.train if n in found]
+    oriented = align_cameras(poses_of(cameras, names), poses_of(truth.train, names))
+    placed = replace(asset, world_from_asset=onto_surface(asset, oriented, truth))
     scene = build_scene(
         placed.mesh, placed.material, placed.world_from_asset, np.ones((8, 16, 3), np.float32)
     )
     scale = fixed_albedo_scale(scene, truth)
     for name, camera in truth.test.items():
-        per_view.setdefault(name, {}).update(material_figures(scene, camera, truth, name, scale))
+        per_view.setdefault(name, {}).update(
+            material_figures(scene, camera, truth, name, scale, constants)
+        )
+    for name, figures in relit_figures(placed, truth, scale, draw).items():
+        per_view[name] |= figures
     values.update(view_means(per_view))
     values.update(chamfer_figures(placed.mesh, placed.world_from_asset, truth))
-    metrics = entries(values, {**definitions.DEFINITIONS, **DEFINITIONS})
     return {
-        "metrics": metrics,
+        "metrics": entries(
+            values,
+            {**common.DEFINITIONS, **DEFINITIONS},
+            baselines | constants.baselines(),
+        ),
         "per_view": per_view,
         "albedo_scale": [float(x) for x in scale],
         "alignment": "sim3",
     }
+
+
+def cameras_and_lights(asset: Asset) -> dict[str, tuple[Camera, np.ndarray]]:
+    """Name without folder and extension -> (camera, light) of each photo. Raises UserError for an
+    asset that is of no collection."""
+    check_lights(asset)
+    return {
+        camera_key(name): (camera, light)
+        for (name, camera), light in zip(asset.cameras, asset.lights, strict=True)
+    }
+
+
+def poses_of(cameras: dict[str, Camera], names: list[str]) -> np.ndarray:
+    """(N, 4, 4) world_from_camera."""
+    return np.array([cameras[n].world_from_camera for n in names])
 
 
 def check_lights(asset: Asset) -> None:
@@ -135,37 +180,57 @@ def camera_pose_figures(
     train: dict[str, Camera],
     test: dict[str, Camera],
     centre=(0.0, 0.0, 0.0),
-) -> tuple[dict[str, float], np.ndarray, dict[str, dict[str, float]]]:
-    """(figures, world_from_found (4, 4), per held-out view figures). train, test: true cameras.
-    centre: (3,) of the object in their frame. Focal lengths are compared in widths of the
-    picture."""
+) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """(figures, per held-out view figures). train, test: true cameras, train of all photos that
+    were to be given a camera. centre: (3,) of the object in their frame. Focal lengths are compared
+    in widths of the picture."""
     names = [n for n in train if n in found]
     if len(names) < 3:
         raise UserError(
             "fewer than 3 recovered cameras have the name of a true one",
             "the asset was made from other photos",
         )
-    a = np.array([found[n].world_from_camera for n in names])
-    b = np.array([train[n].world_from_camera for n in names])
-    angle, distance = camera_errors(a, b)
-    good = angle <= max(3 * float(np.median(angle)), 1.0)
-    world_from_found = align_poses(a[good], b[good])
+    a, b = poses_of(found, names), poses_of(train, names)
+    world_from_found = align_centres(a[:, :3, 3], b[:, :3, 3])
+    turn = nearest_rotation(world_from_found[:3, :3])
+    angle = angles_between(turn @ a[:, :3, :3], b[:, :3, :3])
+    distance = np.linalg.norm(move_points(world_from_found, a[:, :3, 3]) - b[:, :3, 3], axis=1)
+    everyone = np.append(angle, np.full(len(train) - len(names), LOST))
     away = float(np.mean(np.linalg.norm(b[:, :3, 3] - np.asarray(centre), axis=1)))
     focal = [abs(found[n].fx / found[n].width * train[n].width / train[n].fx - 1) for n in names]
     values = {
+        "cameras": 100 * len(names) / len(train),
         "rotation_mean": float(angle.mean()),
-        "rotation_median": float(np.median(angle)),
-        "rotation_within_10": float(100 * (angle < WITHIN).mean()),
+        "rotation_median": float(np.median(everyone)),
+        "rotation_within_10": float(100 * (everyone < WITHIN).mean()),
         "translation_percent": float(100 * distance.mean() / away),
         "focal_percent": float(100 * np.mean(focal)),
     }
     per_view = {}
     for n in (n for n in test if n in found):
-        moved = move_pose(world_from_found, found[n].world_from_camera)
-        per_view[n] = {
-            "held_out_rotation": rotation_angle(moved[:3, :3].T @ test[n].world_from_camera[:3, :3])
-        }
-    return values, world_from_found, per_view
+        r = turn @ found[n].world_from_camera[:3, :3]
+        error = float(angles_between(r, test[n].world_from_camera[:3, :3]))
+        per_view[n] = {"held_out_rotation": error}
+    return values, per_view
+
+
+def camera_chance(
+    found: dict[str, Camera],
+    train: dict[str, Camera],
+    test: dict[str, Camera],
+    centre=(0.0, 0.0, 0.0),
+) -> Baselines:
+    """What true cameras that are each turned at random about the object score under
+    `camera_pose_figures`."""
+    both = {n: c for n, c in {**train, **test}.items() if n in found}
+
+    def drawn(rng: np.random.Generator) -> dict[str, float]:
+        turned = turned_about(centre, both, random_rotations(len(both), rng))
+        values, per_view = camera_pose_figures(turned, train, test, centre)
+        del values["focal_percent"], values["cameras"]
+        return values | view_means(per_view)
+
+    return chance(drawn)
 
 
 def onto_surface(
@@ -195,24 +260,33 @@ def onto_surface(
     return placed @ asset.world_from_asset
 
 
-def picture_figures(
-    asset: Asset, camera: Camera, light: np.ndarray, reference: np.ndarray, spp: int, seed: int
+def picture_figures_on_white(
+    asset: Asset, camera: Camera, light: np.ndarray, reference: np.ndarray, draw: Draw
 ) -> dict[str, float]:
     """A held-out photo: the asset under the light fitted to it, against the true linear RGBA (H, W,
     4), premultiplied on black."""
-    from relit.reference.mitsuba_scene import build_scene, render
-
-    height, width = reference.shape[:2]
-    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, light)
-    shown = render(scene, camera.resized(width, height), spp=spp, seed=seed)
+    shown = shown_under(asset, camera, light, reference.shape[:2], draw)
     a, b = on_white(shown), on_white(reference)
     inside = reference[..., 3] >= m.MASK
-    return {
+    s = m.ssim_map(a, b)
+    out = {
         "novel_psnr": m.psnr(a, b),
-        "novel_ssim": float(m.ssim_map(a, b).mean()),
+        "novel_ssim": float(s.mean()),
         "novel_psnr_masked": m.psnr(m.encode(shown[..., :3]), m.encode(reference[..., :3]), inside),
+        "novel_ssim_masked": float(s[inside].mean()) if inside.any() else float("nan"),
         "novel_mask_iou": m.mask_iou(shown[..., 3], reference[..., 3]),
     }
+    return out if draw.lpips is None else out | {"novel_lpips": draw.lpips(a, b)}
+
+
+def shown_under(
+    asset: Asset, camera: Camera, light: np.ndarray, size: tuple[int, ...], draw: Draw
+) -> np.ndarray:
+    """(H, W, 4) linear, premultiplied on black, of size (H, W): the asset under a light."""
+    from relit.reference.mitsuba_scene import build_scene, render
+
+    scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, light)
+    return render(scene, camera.resized(size[1], size[0]), spp=draw.spp, seed=draw.seed)
 
 
 def on_white(rgba: np.ndarray) -> np.ndarray:

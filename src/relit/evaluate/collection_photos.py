@@ -15,20 +15,30 @@ import numpy as np
 
 from relit.capture.readers import llff
 from relit.errors import UserError
+from relit.evaluate.baselines import Baselines
 from relit.evaluate.collection import (
     DEFINITIONS,
+    camera_chance,
     camera_pose_figures,
     check_lights,
-    picture_figures,
+    picture_figures_on_white,
 )
+from relit.evaluate.lpips import Lpips
 from relit.evaluate.photos import SIDE, capture_of, shrunk_to_camera
+from relit.evaluate.picture_figures import Draw
 from relit.evaluate.results import entries
 from relit.masks.grabcut import centre_cut
 from relit.scene import Asset, Camera, Capture, Photo
 
 
 def evaluate_on_collection(
-    asset: Asset, folder: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0
+    asset: Asset,
+    folder: Path,
+    *,
+    run: Path | None = None,
+    spp: int = 256,
+    seed: int = 0,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """The figures of an asset against the photos that it was made from. run: the run folder, whose
     settings say how they were read.
@@ -52,8 +62,10 @@ def evaluate_on_collection(
         )
     held = [name for name in asset.meta.get("held_out", ()) if name in found and name in photos]
     truth, source = true_cameras(capture)
-    train = {name: camera for name, camera in truth.items() if name in found and name not in held}
-    if not held and len(train) < 3:
+    aside = set(asset.meta.get("held_out", ()))
+    train = {n: camera for n, camera in truth.items() if n in photos and n not in aside}
+    posed = sum(n in found for n in train)
+    if not held and posed < 3:
         raise UserError(
             "there is nothing to measure this collection by",
             "no photo was set aside when it was reconstructed, and the folder holds no true cameras",
@@ -61,12 +73,13 @@ def evaluate_on_collection(
         )
     values: dict[str, float] = {}
     per_view: dict[str, dict[str, float]] = {name: {} for name in held}
-    notes = {}
-    if len(train) >= 3:
+    notes: dict[str, str] = {}
+    baselines: Baselines = {}
+    if posed >= 3:
         test = {name: truth[name] for name in held if name in truth}
-        values, _, turned = camera_pose_figures(
-            {n: c for n, (c, _) in found.items()}, train, test, middle_of(train)
-        )
+        cameras, middle = {n: c for n, (c, _) in found.items()}, middle_of(train)
+        values, turned = camera_pose_figures(cameras, train, test, middle)
+        baselines = camera_chance(cameras, train, test, middle)
         for name, figures in turned.items():
             per_view[name].update(figures)
         notes = dict.fromkeys(
@@ -77,9 +90,10 @@ def evaluate_on_collection(
     for i, name in enumerate(held):
         reference, cut = reference_of(photos[name])
         guessed += cut
-        per_view[name].update(picture_figures(asset, *found[name], reference, spp, seed + i))
+        one = Draw(spp, seed + i, lpips)
+        per_view[name].update(picture_figures_on_white(asset, *found[name], reference, one))
     masks = f", {guessed} of {len(held)} guessed by GrabCut as the fit does" if guessed else ""
-    for key in ("novel_psnr", "novel_ssim", "novel_psnr_masked", "novel_mask_iou"):
+    for key in (k for k in DEFINITIONS if k.startswith("novel_")):
         notes[key] = (
             f"; photos shrunk to at most {SIDE} pixels a side, their masks for the true coverage{masks}"
         )
@@ -88,12 +102,12 @@ def evaluate_on_collection(
             np.nanmean([figures[key] for figures in per_view.values() if key in figures])
         )
     noted = {
-        name: (unit, text + notes[name])
+        name: (unit, text + notes.get(name, ""))
         for name, (unit, text) in DEFINITIONS.items()
         if name in values
     }
     return {
-        "metrics": entries(values, noted),
+        "metrics": entries(values, noted, baselines),
         "per_view": per_view,
         "photos": len(held),
         "alignment": "sim3",

@@ -4,28 +4,19 @@ beside the number."""
 from __future__ import annotations
 
 from relit.evaluate import metrics as m
+from relit.evaluate.environments import ENVIRONMENT_DEFINITIONS
+from relit.evaluate.picture_figures import definitions_of
 
 SURFACE_SAMPLES = 100_000  # points per mesh for the Chamfer distance
 ROUNDTRIP_VIEWS, ROUNDTRIP_SIDE, ROUNDTRIP_SPP = 3, 400, 64  # pictures, pixels, samples a pixel
 
 SCALE = "one factor per channel on the linear base colour, sum(truth) / sum(predicted) over the object's pixels of a few TRAINING views"
 DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
-    "novel_psnr": ("dB", f"test views under the recovered light: {m.DEFINITIONS['psnr']}"),
-    "novel_psnr_masked": (
-        "dB",
-        f"test views under the recovered light: {m.DEFINITIONS['psnr_masked']}",
+    **definitions_of("novel", "test views under the recovered light"),
+    **definitions_of(
+        "relit",
+        f"test views under the unseen lights, mean over lights, base colour scaled ({SCALE})",
     ),
-    "novel_ssim": ("", f"test views under the recovered light: {m.DEFINITIONS['ssim']}"),
-    "novel_ssim_masked": (
-        "",
-        f"test views under the recovered light: {m.DEFINITIONS['ssim_masked']}",
-    ),
-    "relit_psnr": (
-        "dB",
-        f"test views under the unseen lights, mean over lights, base colour scaled ({SCALE}): {m.DEFINITIONS['psnr']}",
-    ),
-    "relit_psnr_masked": ("dB", f"as relit_psnr: {m.DEFINITIONS['psnr_masked']}"),
-    "relit_ssim": ("", f"as relit_psnr: {m.DEFINITIONS['ssim']}"),
     "relit_psnr_unscaled": (
         "dB",
         "as relit_psnr, without any scale, rendered with a quarter of the samples",
@@ -33,6 +24,11 @@ DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
     "relit_psnr_masked_unscaled": (
         "dB",
         "as relit_psnr_masked, without any scale, rendered with a quarter of the samples",
+    ),
+    "relit_ssim_unscaled": ("", "as relit_ssim, without any scale, a quarter of the samples"),
+    "relit_ssim_masked_unscaled": (
+        "",
+        "as relit_ssim_masked, without any scale, a quarter of the samples",
     ),
     "albedo_psnr": (
         "dB",
@@ -66,24 +62,17 @@ DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
         "world units",
         "the half of chamfer from the truth to the reconstruction",
     ),
-    "environment_mse": (
-        "",
-        "recovered against true light, lat-long 256x512, clipped to [0, 1], to the power 1/2.2, mean of all texels (SfD)",
-    ),
-    "environment_mse_scaled": (
-        "",
-        "as environment_mse, the recovered light divided by the albedo scale first",
-    ),
-    "environment_log_rmse": (
-        "stops",
-        "root mean square difference of log2 radiance by solid angle at 32x64, below 1 % of the mean raised to it, light divided by the "
-        "albedo scale first",
-    ),
+    **ENVIRONMENT_DEFINITIONS,
     "glb_roundtrip_psnr": (
         "dB",
         f"asset read back from object.glb against pictures that the fit rendered of what it held in memory, {ROUNDTRIP_VIEWS} training "
         f"views, recovered light, same random numbers: {m.DEFINITIONS['psnr']}",
     ),
+    "glb_roundtrip_psnr_masked": (
+        "dB",
+        f"as glb_roundtrip_psnr, over pixels with coverage >= {m.MASK} in the pictures of the fit",
+    ),
+    "glb_roundtrip_ssim": ("", f"as glb_roundtrip_psnr: {m.DEFINITIONS['ssim']}"),
     "camera_rotation": (
         "degrees",
         "median rotation error of the recovered cameras after Sim(3) alignment to the true ones",

@@ -8,37 +8,81 @@ that agrees best with all registered instances.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from relit.conventions import move_points, world_from_cv_camera
+from relit.conventions import move_points
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.pile_alignment import grown_about, object_turn, scene_alignment
+from relit.evaluate.alignment import angles_between
+from relit.evaluate.baselines import Baselines, Constants, chance, random_rotations
+from relit.evaluate.environments import ENVIRONMENT_DEFINITIONS, environment_figures
+from relit.evaluate.lpips import Lpips
+from relit.evaluate.picture_figures import LPIPS, Draw, picture_figures
+from relit.evaluate.pile_alignment import (
+    frame_by_poses,
+    grown_about,
+    object_turn,
+    scene_alignment,
+)
+from relit.evaluate.pile_views import PileTruth, PileViews, load_pile_truth, registered_poses
 from relit.evaluate.results import entries, view_means
 from relit.files import parse_toml
-from relit.geometry.se3 import nearest_rotation, rotation_angle
-from relit.scene import Asset, Camera, Ground, Pixels
+from relit.geometry.se3 import nearest_rotation
+from relit.scene import Asset, Camera, Pixels
 
 VISIBLE = (
     0.25  # share of an instance that must be seen for it to count among those to be registered
 )
 SAMPLES = 30_000
 PHOTO_SIDE = 480  # pixels of the re-rendered photo, longer side
+LOST = 180.0  # degrees: the rotation error of an instance that is not registered
 MASKED = f"pixels of the objects (truth coverage >= {m.MASK}) in novel views of the whole pile; a pixel without a prediction is black"
+FRAME = "novel views of the whole pile, whole frame, black where no object is"
+RELIT = "the pile under unseen lights, base colour times the factors of albedo_psnr"
+NOVEL = "the pile under the recovered light"
+PHOTO = (
+    f"the photo, its longer side shrunk to {PHOTO_SIDE} pixels, re-rendered with its own camera and "
+    "light, sRGB-encoded"
+)
+
+
+def _pictures(prefix: str, what: str, over: str) -> dict[str, tuple[str, str]]:
+    """Definitions of the pile's pictures: PREFIX_psnr is over the mask, PREFIX_psnr_frame over the
+    whole frame."""
+    ssim = "SSIM (Gaussian 11 x 11, sigma 1.5), sRGB-encoded"
+    return {
+        f"{prefix}_psnr": ("dB", f"{what}, sRGB-encoded, {MASKED}; mean of the PSNR over {over}"),
+        f"{prefix}_psnr_frame": ("dB", f"{what}, sRGB-encoded, {FRAME}; mean over {over}"),
+        f"{prefix}_ssim": ("", f"{what}, {ssim}, {MASKED}; mean over {over}"),
+        f"{prefix}_ssim_frame": ("", f"{what}, {ssim}, {FRAME}; mean over {over}"),
+        f"{prefix}_lpips": ("", f"{what}, {LPIPS['lpips_masked']}"),
+        f"{prefix}_lpips_frame": ("", f"{what}, {LPIPS['lpips']}"),
+    }
+
+
 DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
     "rotation_median": (
         "degrees",
-        "median over registered instances of the rotation error, after the one turn of the object's frame that fits all",
+        "median over ALL instances that the photo shows of the rotation error, after the one turn of the object's frame that fits the "
+        f"registered ones best; an instance that is not registered counts {LOST:g} degrees",
+    ),
+    "rotation_median_registered": (
+        "degrees",
+        "as rotation_median, over registered instances only",
     ),
     "rotation_pairs": (
         "degrees",
         "median over pairs of registered instances of the error of their relative rotation",
     ),
-    "rotation_worst": ("degrees", "largest of the errors of which rotation_median is the median"),
+    "rotation_worst": (
+        "degrees",
+        "largest of the errors of which rotation_median_registered is the median",
+    ),
     "rotation_before": (
         "degrees",
         "rotation_median of the poses before the joint refinement with shape and appearance",
@@ -46,7 +90,7 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
     "pairs_before": ("degrees", "rotation_pairs of the poses before the joint refinement"),
     "translation_median": (
         "radii",
-        "median distance of the objects' centres from the true ones after the one scale about the camera, in radii",
+        "median distance of the registered objects' centres from the true ones after the one scale about the camera, in radii",
     ),
     "surface_median": (
         "radii",
@@ -59,195 +103,151 @@ DUPLICATES_DEFINITIONS: dict[str, tuple[str, str]] = {
     ),
     "albedo_psnr": (
         "dB",
-        f"base colour, one factor per channel over all test views, sRGB-encoded, {MASKED}; mean of the per-view PSNR",
+        f"base colour, one linear factor per channel over all test views, sRGB-encoded, {MASKED}; mean of the per-view PSNR",
     ),
-    "roughness_mse": ("", f"perceptual roughness, {MASKED}"),
-    "metallic_mse": ("", f"metallic, {MASKED}"),
-    "novel_psnr": (
-        "dB",
-        f"the pile under the recovered light, sRGB-encoded, {MASKED}; mean of the per-view PSNR",
-    ),
-    "relit_psnr": (
-        "dB",
-        f"the pile under unseen lights, base colour times the factors of albedo_psnr, sRGB-encoded, {MASKED}; mean over lights, views",
-    ),
-    "environment_mse": (
-        "",
-        "recovered against true light, lat-long 256x512, clipped to [0, 1], to the power 1/2.2, mean of all texels (SfD)",
-    ),
-    "environment_mse_scaled": (
-        "",
-        "as environment_mse, the recovered light divided by the factors of albedo_psnr first",
-    ),
+    "roughness_mse": ("", f"perceptual roughness, mean squared error, {MASKED}"),
+    "metallic_mse": ("", f"metallic, mean squared error, {MASKED}"),
+    **_pictures("novel", NOVEL, "views"),
+    **_pictures("relit", RELIT, "lights and views"),
+    **ENVIRONMENT_DEFINITIONS,
     "chamfer": (
         "radii",
-        "mean of the two mean distances between points of both whole surfaces after a similarity (ICP), in radii of the true object",
+        f"mean of the two mean distances between {SAMPLES} points uniform by area on each whole surface, in radii of the true object, "
+        "after the similarity that the poses and the camera give (SfD): no surface is consulted for it",
     ),
-    "photo_psnr": (
+    "chamfer_icp": (
+        "radii",
+        "as chamfer, after a similarity fitted between the two surfaces (ICP): the error of the shape alone",
+    ),
+    "photo_psnr": ("dB", f"{PHOTO}, PSNR over pixels that lie wholly in registered instances"),
+    "photo_psnr_frame": (
         "dB",
-        f"the photo, its longer side shrunk to {PHOTO_SIDE} pixels, re-rendered with its own camera and light, sRGB-encoded, over pixels "
-        "that lie wholly in registered instances",
+        f"{PHOTO}, PSNR of the whole frame, black in both where no registered instance is",
     ),
+    "photo_ssim": (
+        "",
+        f"{PHOTO}, SSIM (Gaussian 11 x 11, sigma 1.5) over pixels that lie wholly in registered instances",
+    ),
+    "photo_ssim_frame": ("", "as photo_ssim, over the whole frame"),
+    "photo_lpips": ("", f"{PHOTO}, LPIPS, black in both where no registered instance is"),
 }
 
 
-@dataclass(frozen=True)
-class PileTruth:
-    """What `relit synthesize duplicates` wrote. content: of truth.json. cameras: of the test views,
-    by name. photo: the camera of the photo. poses: label -> world_from_object (4, 4)."""
-
-    folder: Path
-    content: dict[str, Any]
-    cameras: list[tuple[str, Camera]]
-    photo: Camera
-    poses: dict[int, np.ndarray]
-
-    def picture(self, name: str) -> np.ndarray:
-        """A linear picture below truth/."""
-        from relit.images import read_data
-
-        return read_data(self.folder / "truth" / f"{name}.exr")
-
-
-def pile_truth(folder: Path) -> PileTruth:
-    """The truth of a rendered pile. Raises UserError where its rendering was stopped."""
-    from relit.asset.asset import read_bounded_json
-
-    if not (folder / "truth" / "truth.json").is_file():
-        raise UserError(
-            "the folder holds no complete truth",
-            "its rendering was stopped",
-            f"make it again: {folder}",
-        )
-    content = read_bounded_json(folder / "truth" / "truth.json")
-    return PileTruth(
-        folder,
-        content,
-        read_transforms(folder / "transforms_test.json"),
-        read_transforms(folder / "transforms_train.json")[0][1],
-        {i["label"]: np.array(i["world_from_object"]) for i in content["instances"]},
-    )
-
-
 def evaluate_duplicates(
-    run: str | Path, truth_folder: str | Path, *, spp: int = 64, seed: int = 0
+    run: str | Path,
+    truth_folder: str | Path,
+    *,
+    spp: int = 64,
+    seed: int = 0,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """Every figure that the truth allows, as `evaluate.dispatch.evaluate`. Raises UserError where
     the truth is unfinished."""
     from relit.asset.asset import load_asset
 
-    asset, truth = load_asset(run), pile_truth(Path(truth_folder))
-    values, scale = _pose_and_shape_figures(Path(run), asset, truth)
-    per_view, factor = _view_figures(asset, truth, scale, spp, seed)
+    asset, truth = load_asset(run), load_pile_truth(Path(truth_folder))
+    draw, constants = Draw(spp, seed, lpips), Constants()
+    values, scale, baselines = _pose_and_shape_figures(Path(run), asset, truth)
+    per_view, factor = _view_figures(PileViews.of(asset, truth, scale), constants, draw)
     light = truth.picture("environment")[..., :3]
-    values["environment_mse"] = m.environment_mse(asset.environment, light)
-    values["environment_mse_scaled"] = m.environment_mse(asset.environment / factor, light)
-    values["photo_psnr"] = photo_figure(asset, truth.folder, spp=spp, seed=seed)
+    values |= environment_figures(asset.environment, light, factor, constants)
+    values |= photo_figures_of(asset, truth.folder, draw)
     values |= view_means(per_view)
+    baselines |= constants.baselines()
     return {
-        "metrics": entries(values, DUPLICATES_DEFINITIONS),
+        "metrics": entries(values, DUPLICATES_DEFINITIONS, baselines),
         "per_view": per_view,
         "albedo_scale": [float(x) for x in factor],
         "alignment": "scale about the camera",
     }
 
 
-def registered_poses(asset: Asset) -> dict[int, np.ndarray]:
-    """label -> world_from_object (4, 4) of the registered instances."""
-    return {
-        i.label: np.asarray(i.world_from_object)
-        for i in asset.instances
-        if i.registered and i.photo == 0
-    }
-
-
 def _pose_and_shape_figures(
     run: Path, asset: Asset, truth: PileTruth
-) -> tuple[dict[str, float], float]:
-    """Figures of poses and shape, and the scale about the photo's camera that aligns the pile."""
+) -> tuple[dict[str, float], float, Baselines]:
+    """Figures of poses and shape, the scale about the photo's camera that aligns the pile, and what
+    random rotations score."""
     import trimesh
 
     poses, photo, radius = registered_poses(asset), truth.photo, truth.content["radius"]
     visible = {i["label"]: i["visible"] for i in truth.content["instances"]}
     values = instance_pose_figures(poses, truth.poses, visible)
+    baselines = instance_chance(list(poses), truth.poses, visible)
     before = poses_before(run, photo, list(poses))
     if len(before) == len(poses):
-        earlier = instance_pose_figures(before, truth.poses, {})
+        earlier = instance_pose_figures(before, truth.poses, visible)
         values["rotation_before"] = earlier["rotation_median"]
         values["pairs_before"] = earlier["rotation_pairs"]
     loaded = trimesh.load(truth.folder / "truth" / "mesh.ply", process=False)
-    points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).points
-    scale, own_middle, frame = scene_alignment(
+    points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).samples
+    scale, own_middle, fitted = scene_alignment(
         poses, truth.poses, photo, points, asset.mesh.vertices
     )
-    centres = centre_error(poses, truth.poses, photo, scale, own_middle, points)
-    values["translation_median"] = centres / radius
+    values["translation_median"] = (
+        centre_error(poses, truth.poses, photo, scale, own_middle, points) / radius
+    )
     some = points[:: SAMPLES // 2000]
-    values["surface_median"] = add_s(poses, truth.poses, photo, scale, frame, some) / radius
-    own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).points
-    values["chamfer"] = sample_chamfer(points, own, frame)
-    return values, scale
+    values["surface_median"] = add_s(poses, truth.poses, photo, scale, fitted, some) / radius
+    own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES, seed=1).samples
+    middle = (points.min(0) + points.max(0)) / 2
+    by_poses = frame_by_poses(poses, truth.poses, scale, own_middle, middle)
+    values["chamfer"] = sample_chamfer(points, own, by_poses)
+    values["chamfer_icp"] = sample_chamfer(points, own, fitted)
+    return values, scale, baselines
 
 
 def _view_figures(
-    asset: Asset, truth: PileTruth, scale: float, spp: int, seed: int
+    views: PileViews, constants: Constants, draw: Draw
 ) -> tuple[dict[str, dict[str, float]], np.ndarray]:
     """Figures of each test view, and the scale of base colour (3,) that they use."""
-    from relit.reference.mitsuba_scene import build_scene, render, render_channels
-    from relit.reference.pile import build_pile
-
-    centre, cameras = truth.photo.centre, truth.cameras
-    moved = [grown_about(centre, scale) @ p for p in registered_poses(asset).values()]
-    ground = None if asset.ground is None else scaled_ground(asset.ground, centre, scale)
-    objects = build_pile(asset.mesh, asset.material, moved)
-    # channels of the objects alone
-    bare = build_scene(objects.mesh, objects.material, np.eye(4), None)
-    predicted = {name: render_channels(bare, camera, spp=16) for name, camera in cameras}
-    reference = {name: truth.picture(f"test/{name}_albedo") for name, _ in cameras}
-    inside = {name: r[..., 3] >= m.MASK for name, r in reference.items()}
+    predicted, inside = views.predicted, views.inside
     both = {name: inside[name] & (predicted[name]["alpha"] > 0) for name in inside}
     factor = m.albedo_scale(
         np.concatenate([predicted[n]["albedo"][both[n]] for n in both]),
-        np.concatenate([reference[n][..., :3][both[n]] for n in both]),
+        np.concatenate([views.albedo[n][..., :3][both[n]] for n in both]),
     )
-
-    def under(material, light, pictures: str) -> dict[str, float]:
-        """PSNR of each view inside the mask, against truth/`pictures`."""
-        pile = build_pile(asset.mesh, material, moved, ground)
-        scene = build_scene(pile.mesh, pile.material, np.eye(4), light)
-        depth, out = truth.content["settings"]["max_depth"], {}
-        for i, (name, camera) in enumerate(cameras):
-            shown = render(scene, camera, spp=spp, seed=seed + i, max_depth=depth)[..., :3]
-            shown = shown * (predicted[name]["alpha"] > 0)[..., None]
-            picture = truth.picture(f"{pictures}/{name}")[..., :3]
-            out[name] = m.psnr(m.encode(shown), m.encode(picture), inside[name])
-        return out
-
-    novel = under(asset.material, asset.environment, "test")
     per_view: dict[str, dict[str, float]] = {}
-    for name, _ in cameras:
-        p, where = predicted[name], inside[name]
-        true_albedo = m.encode(reference[name][..., :3])
-        per_view[name] = {
-            f"{key}_mse": float(
-                np.square(p[key] - truth.picture(f"test/{name}_{key}"))[where].mean()
-            )
-            for key in ("roughness", "metallic")
-        }
-        albedo = m.encode(p["albedo"] * factor)
-        per_view[name]["albedo_psnr"] = m.psnr(albedo, true_albedo, where)
-        per_view[name]["novel_psnr"] = novel[name]
+    for name, p in predicted.items():
+        where, figures = inside[name], per_view.setdefault(name, {})
+        for key in ("roughness", "metallic"):
+            true = views.truth.picture(f"test/{name}_{key}")
+            figures[f"{key}_mse"] = float(np.square(p[key] - true)[where].mean())
+            constants.add(f"{key}_mse", true, where)
+        true_albedo = m.encode(views.albedo[name][..., :3])
+        figures["albedo_psnr"] = m.psnr(m.encode(p["albedo"] * factor), true_albedo, where)
+        constants.add("albedo_psnr", true_albedo, where)
+    asset = views.asset
+    for name, pair in views.pictures(asset.material, asset.environment, "test", draw).items():
+        per_view[name] |= _pile_pictures("novel", *pair, inside[name], draw.lpips)
     base = np.clip(asset.material.base_color * factor, 0, 1).astype(np.float32)
-    for light in truth.content["relight"]:
-        radiance = truth.picture(f"relight/{light}")[..., :3]
-        relit = under(replace(asset.material, base_color=base), radiance, f"relight/{light}")
-        for name, value in relit.items():
-            per_view[name][f"relit_psnr:{light}"] = value
+    scaled = replace(asset.material, base_color=base)
+    for light in views.truth.content["relight"]:
+        radiance = views.truth.picture(f"relight/{light}")[..., :3]
+        for name, pair in views.pictures(scaled, radiance, f"relight/{light}", draw).items():
+            figures = _pile_pictures("relit", *pair, inside[name], draw.lpips)
+            per_view[name] |= {f"{key}:{light}": value for key, value in figures.items()}
     return per_view, factor
 
 
+def _pile_pictures(prefix: str, shown, truth, inside, lpips: Lpips | None) -> dict[str, float]:
+    """`picture_figures` under the pile's names: without a tail inside the mask, `_frame` the whole
+    frame."""
+    figures = picture_figures(shown, truth, inside, lpips)
+    out = {}
+    for name in ("psnr", "ssim", "lpips"):
+        if name in figures:
+            out[f"{prefix}_{name}"] = figures[f"{name}_masked"]
+            out[f"{prefix}_{name}_frame"] = figures[name]
+    return out
+
+
 def evaluate_on_photo(
-    run: str | Path, capture: str | Path, *, spp: int = 64, seed: int = 0
+    run: str | Path,
+    capture: str | Path,
+    *,
+    spp: int = 64,
+    seed: int = 0,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """Figures of a real photo: the photo re-rendered, and the rotations against SfD's poses where
     its `object_pred_pose.json` lies there.
@@ -258,23 +258,22 @@ def evaluate_on_photo(
     from relit.asset.asset import load_asset
 
     asset, capture = load_asset(run), Path(capture)
-    values = {"photo_psnr": photo_figure(asset, capture, run=Path(run), spp=spp, seed=seed)}
+    values = photo_figures_of(asset, capture, Draw(spp, seed, lpips), run=Path(run))
+    baselines: Baselines = {}
     reference = reference_poses(capture, asset.cameras[0][1])
-    poses = {
-        i.label: np.asarray(i.world_from_object)
-        for i in asset.instances
-        if i.registered and i.photo == 0
-    }
+    poses = registered_poses(asset)
     if reference:
-        values.update(instance_pose_figures(poses, reference, dict.fromkeys(reference, 1.0)))
+        visible = dict.fromkeys(reference, 1.0)
+        values.update(instance_pose_figures(poses, reference, visible))
+        baselines = instance_chance(list(poses), reference, visible)
         before = poses_before(Path(run), asset.cameras[0][1], list(poses))
         if len(before) == len(poses):
-            earlier = instance_pose_figures(before, reference, {})
+            earlier = instance_pose_figures(before, reference, visible)
             values["rotation_before"], values["pairs_before"] = (
                 earlier["rotation_median"],
                 earlier["rotation_pairs"],
             )
-    return {"metrics": entries(values, DUPLICATES_DEFINITIONS), "per_view": {}}
+    return {"metrics": entries(values, DUPLICATES_DEFINITIONS, baselines), "per_view": {}}
 
 
 def reference_poses(capture: Path, camera: Camera) -> dict[int, np.ndarray]:
@@ -321,11 +320,11 @@ def labelled_pixels(capture: Path, run: Path | None, focal: float) -> Pixels | N
     return None if source is None else open_duplicates(source, focal=focal).photos[0].load()
 
 
-def photo_figure(
-    asset: Asset, capture: Path, *, run: Path | None = None, spp: int = 64, seed: int = 0
-) -> float:
-    """PSNR of the re-rendered photo over the pixels of registered instances (see photo_psnr). run:
-    whose settings say where the labels are from."""
+def photo_figures_of(
+    asset: Asset, capture: Path, draw: Draw, *, run: Path | None = None
+) -> dict[str, float]:
+    """photo_psnr, photo_ssim and photo_lpips of the re-rendered photo over the pixels of registered
+    instances and over the frame. run: whose settings say where the labels are from."""
     from relit.evaluate.photos import shrunk_to_camera
     from relit.reference.photographed import as_photographed
 
@@ -344,39 +343,22 @@ def photo_figure(
         shrunk_to_camera(pixels.rgb, camera),
         shrunk_to_camera(own.astype(np.float32), camera) >= m.MASK,
     )
-    picture = as_photographed(asset)(asset.cameras[0][0], camera, spp=spp, seed=seed)
-    return m.psnr(m.encode(picture[..., :3]), m.encode(rgb), where)
-
-
-def read_transforms(file: Path) -> list[tuple[str, Camera]]:
-    """(name, Camera) pairs of a transforms file with one focal length."""
-    from relit.asset.asset import read_bounded_json
-
-    data = read_bounded_json(file)
-    w, h, f = data["w"], data["h"], float(data["focal"])
-    return [
-        (
-            Path(x["file_path"]).stem,
-            Camera(
-                w,
-                h,
-                f,
-                f,
-                w / 2,
-                h / 2,
-                world_from_cv_camera(np.array(x["transform_matrix"], np.float64)),
-            ),
-        )
-        for x in data["frames"]
-    ]
+    shown = as_photographed(asset)(asset.cameras[0][0], camera, spp=draw.spp, seed=draw.seed)
+    only = where[..., None]
+    figures = _pile_pictures("photo", shown[..., :3] * only, rgb * only, where, draw.lpips)
+    figures.pop("photo_lpips_frame", None)  # the pictures are black outside: it is the same
+    return figures
 
 
 # ---------------------------------------------------------------- poses
 
 
-def instance_pose_figures(poses: dict, true_poses: dict, visible: dict) -> dict[str, float]:
-    """rotation_median, rotation_worst, rotation_pairs and, where the visible shares are known,
-    registered."""
+def instance_pose_figures(
+    poses: Mapping, true_poses: Mapping, visible: Mapping
+) -> dict[str, float]:
+    """The rotation figures of registered instances. poses: world_from_object (4, 4) by label.
+    visible: label -> share that the photo shows, of all instances of the truth; those of share 0
+    do not count. Raises UserError where no label is known."""
     keys = [k for k in poses if k in true_poses]
     poses = {k: poses[k] for k in keys}
     if not keys:
@@ -384,24 +366,40 @@ def instance_pose_figures(poses: dict, true_poses: dict, visible: dict) -> dict[
             "no registered instance has a label of the truth",
             fix="is this the capture that the run was made from?",
         )
-    turn = object_turn(poses, true_poses)
-    a = {k: nearest_rotation(poses[k][:3, :3]) @ turn for k in keys}
-    b = {k: nearest_rotation(true_poses[k][:3, :3]) for k in keys}
-    errors = {k: rotation_angle(a[k].T @ b[k]) for k in keys}
-    pairs = [
-        rotation_angle((a[i] @ a[j].T).T @ (b[i] @ b[j].T))
-        for n, i in enumerate(keys)
-        for j in keys[:n]
-    ]
+    turn = object_turn(poses, dict(true_poses))
+    a = np.array([nearest_rotation(poses[k][:3, :3]) @ turn for k in keys])
+    b = np.array([nearest_rotation(true_poses[k][:3, :3]) for k in keys])
+    errors = dict(zip(keys, angles_between(a, b), strict=True))
+    i, j = np.tril_indices(len(keys), -1)
+    transposed = np.swapaxes(a, 1, 2), np.swapaxes(b, 1, 2)
+    pairs = angles_between(a[i] @ transposed[0][j], b[i] @ transposed[1][j])
+    lost = [k for k, share in visible.items() if share > 0 and k not in errors]
+    registered = np.array(list(errors.values()))
     out = {
-        "rotation_median": float(np.median(list(errors.values()))),
-        "rotation_worst": max(errors.values()),
+        "rotation_median": float(np.median([*registered, *(LOST for _ in lost)])),
+        "rotation_median_registered": float(np.median(registered)),
+        "rotation_worst": float(registered.max()),
+        "rotation_pairs": float(np.median(pairs)) if len(pairs) else 0.0,
     }
-    out["rotation_pairs"] = float(np.median(pairs)) if pairs else 0.0
-    asked = [k for k, v in visible.items() if v >= VISIBLE]
-    if asked:
-        out["registered"] = 100.0 * float(np.mean([errors.get(k, 180.0) < 10 for k in asked]))
+    wanted = [k for k, share in visible.items() if share >= VISIBLE]
+    if wanted:
+        out["registered"] = 100.0 * float(np.mean([errors.get(k, LOST) < 10 for k in wanted]))
     return out
+
+
+def instance_chance(labels: list[int], true_poses: Mapping, visible: Mapping) -> Baselines:
+    """What uniformly random rotations of the registered instances score under
+    `instance_pose_figures`."""
+    known = [k for k in labels if k in true_poses]
+
+    def drawn(rng: np.random.Generator) -> dict[str, float]:
+        poses = {}
+        for k, turn in zip(known, random_rotations(len(known), rng), strict=True):
+            poses[k] = np.eye(4)
+            poses[k][:3, :3] = turn
+        return instance_pose_figures(poses, true_poses, visible)
+
+    return chance(drawn) if known else {}
 
 
 def poses_before(run: Path, photo: Camera, labels: list[int]) -> dict[int, np.ndarray]:
@@ -419,12 +417,6 @@ def poses_before(run: Path, photo: Camera, labels: list[int]) -> dict[int, np.nd
     except (*NO_ARRAYS, KeyError):  # not there, or damaged
         return {}
     return {k: photo.world_from_camera @ np.linalg.inv(found[k]) for k in labels if k in found}
-
-
-def scaled_ground(g: Ground, centre: np.ndarray, scale: float) -> Ground:
-    return replace(
-        g, point=move_points(grown_about(centre, scale), g.point), radius=g.radius * scale
-    )
 
 
 def centre_error(
@@ -460,14 +452,8 @@ def add_s(
 
 def sample_chamfer(true_points: np.ndarray, own: np.ndarray, frame: np.ndarray) -> float:
     """Mean of the two mean nearest distances between samples, in radii of the true object."""
-    from scipy.spatial import cKDTree
-
     back = move_points(np.linalg.inv(frame), own)
     radius = np.linalg.norm(
         true_points - (true_points.min(0) + true_points.max(0)) / 2, axis=1
     ).max()
-    one, two = (
-        cKDTree(true_points).query(back)[0].mean(),
-        cKDTree(back).query(true_points)[0].mean(),
-    )
-    return float((one + two) / 2 / radius)
+    return float(m.point_chamfer(back, true_points)[0] / radius)

@@ -1,16 +1,16 @@
-"""Figures of a flash capture's asset against its truth: PIR's own protocol, and inside the true
+"""Figures of a flash capture's asset against its truth, over the whole frame and inside the true
 mask.
 
 The truth is a folder that `relit synthesize flash` made, or any in IRON's layout whose `test/`
-holds diffuse_albedo, specular_albedo and specular_roughness with `light.txt` beside. PIR's
-protocol: pictures over the whole frame; albedos linear, times the ratio of the intensities
-(predicted over true), within the predicted mask, over the whole frame; roughness (the lobe's width
-alpha) over the whole frame.
+holds diffuse_albedo, specular_albedo and specular_roughness with `light.txt` beside. Albedos are
+linear and compared times the ratio of the intensities (predicted over true); roughness is the
+lobe's width alpha. PIR's own protocol: `evaluate.protocols.pir`.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,19 +20,17 @@ import numpy as np
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.alignment import aligned
+from relit.evaluate.baselines import Constants
+from relit.evaluate.lpips import Lpips
+from relit.evaluate.picture_figures import Draw, definitions_of, picture_figures
 from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
 from relit.scene import Asset, Camera, Flash
 
 RATIO = "times the ratio of intensities, predicted over true (albedos and intensity share a factor)"
-FRAME = "whole frame, black outside the object's mask (PIR's protocol)"
+FRAME = "whole frame, black outside the object's mask"
 FLASH_DEFINITIONS: dict[str, tuple[str, str]] = {
-    "novel_psnr": ("dB", f"test views under the recovered moving flash: {m.DEFINITIONS['psnr']}"),
-    "novel_psnr_masked": (
-        "dB",
-        f"test views under the recovered moving flash: {m.DEFINITIONS['psnr_masked']}",
-    ),
-    "novel_ssim": ("", f"test views under the recovered moving flash: {m.DEFINITIONS['ssim']}"),
+    **definitions_of("novel", "test views under the recovered moving flash"),
     "diffuse_psnr": (
         "dB",
         f"diffuse albedo in test views, linear, {RATIO}, {FRAME}; mean of the per-view PSNR",
@@ -151,9 +149,14 @@ def in_true_frame(asset: Asset, truth: FlashTruth) -> Asset:
 
 
 def evaluate_flash(
-    run_or_asset: str | Path, truth_folder: str | Path, *, spp: int = 256, seed: int = 0
+    run_or_asset: str | Path,
+    truth_folder: str | Path,
+    *,
+    spp: int = 256,
+    seed: int = 0,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
-    """Every figure of FLASH_DEFINITIONS: {"metrics": {name: {"value", "unit", "definition"}},
+    """Every figure of FLASH_DEFINITIONS: {"metrics": {name: {"value", "unit", "definition", ...}},
     "per_view": {view: {name: value}}}.
 
     spp: samples a pixel of the pictures. Call `relit.device.use_device` first. Raises UserError for
@@ -162,87 +165,132 @@ def evaluate_flash(
     from relit.asset.asset import load_asset
 
     return evaluate_flash_asset(
-        load_asset(run_or_asset), load_flash_truth(truth_folder), spp=spp, seed=seed
+        load_asset(run_or_asset), load_flash_truth(truth_folder), spp=spp, seed=seed, lpips=lpips
     )
 
 
 def evaluate_flash_asset(
-    asset: Asset, truth: FlashTruth, *, spp: int = 256, seed: int = 0
+    asset: Asset, truth: FlashTruth, *, spp: int = 256, seed: int = 0, lpips: Lpips | None = None
 ) -> dict[str, Any]:
     """As `evaluate_flash`, for an asset in memory."""
     from relit.lighting.flash import seen_angle
-    from relit.reference.flash_scene import build_flash_scene
 
+    asset = in_true_frame(asset, truth)
+    constants = Constants()
+    per_view = {
+        view.name: view_figures(view, constants, lpips)
+        for view in flash_views(asset, truth, Draw(spp, seed))
+    }
+    values = view_means(per_view)
+    flash = flash_of(asset)
+    values["flash_angle"] = seen_angle(flash, truth.flash, list(truth.test.values()), truth.centre)
+    values["intensity_ratio"] = intensity_ratio(asset, truth)
+    if (truth.folder / "truth" / "mesh.ply").is_file():
+        values["chamfer_percent"] = chamfer_figures(asset.mesh, asset.world_from_asset, truth)[
+            "chamfer_percent"
+        ]
+    return {
+        "metrics": entries(values, FLASH_DEFINITIONS, constants.baselines()),
+        "per_view": per_view,
+    }
+
+
+def flash_of(asset: Asset) -> Flash:
+    """The asset's flash. Raises UserError where it has none."""
     if asset.flash is None:
         raise UserError(
             "the asset has no flash",
             "it was not made from a flash capture",
             "reconstruct with --capture flash",
         )
-    asset = in_true_frame(asset, truth)
+    return asset.flash
+
+
+def intensity_ratio(asset: Asset, truth: FlashTruth) -> float:
+    """Predicted over true intensity of the flash."""
+    return float(flash_of(asset).intensity.mean() / truth.flash.intensity.mean())
+
+
+@dataclass(frozen=True)
+class FlashView:
+    """A test view. picture, photo: recovered and true linear pictures (H, W, 3) on black.
+    coverage: (H, W) of the recovered object. diffuse (H, W, 3), specular, alpha (H, W): pairs
+    (recovered, true), linear, the albedos times the ratio of intensities, 0 outside the recovered
+    coverage. normals: (recovered (H, W, 3), true (H, W, 4) with coverage), or None where the truth
+    has none."""
+
+    name: str
+    picture: np.ndarray
+    photo: np.ndarray
+    coverage: np.ndarray
+    diffuse: tuple[np.ndarray, np.ndarray]
+    specular: tuple[np.ndarray, np.ndarray]
+    alpha: tuple[np.ndarray, np.ndarray]
+    normals: tuple[np.ndarray, np.ndarray] | None
+
+
+def flash_views(asset: Asset, truth: FlashTruth, draw: Draw) -> Iterator[FlashView]:
+    """Renders the test views one by one. The asset stands in the truth's frame."""
+    from relit.images import read_data
+    from relit.reference.flash_scene import build_flash_scene, render_flash, render_maps
+    from relit.reference.photographed import FLASH_DEPTH
+
+    flash, ratio = flash_of(asset), intensity_ratio(asset, truth)
     scene = build_flash_scene(asset.mesh, asset.material, asset.world_from_asset)
-    ratio = float(asset.flash.intensity.mean() / truth.flash.intensity.mean())
-    per_view = {
-        name: view_figures(scene, asset, truth, name, camera, ratio, spp, seed + i)
-        for i, (name, camera) in enumerate(truth.test.items())
-    }
-    values = view_means(per_view)
-    values["flash_angle"] = seen_angle(
-        asset.flash, truth.flash, list(truth.test.values()), truth.centre
-    )
-    values["intensity_ratio"] = ratio
-    if (truth.folder / "truth" / "mesh.ply").is_file():
-        values["chamfer_percent"] = chamfer_figures(asset.mesh, asset.world_from_asset, truth)[
-            "chamfer_percent"
-        ]
-    return {"metrics": entries(values, FLASH_DEFINITIONS), "per_view": per_view}
+    for i, (name, camera) in enumerate(truth.test.items()):
+        picture = render_flash(
+            scene, camera, flash, draw.spp, seed=draw.seed + i, max_depth=FLASH_DEPTH
+        )
+        # primary rays alone; fewer leave noise at outlines that costs half a dB
+        maps = render_maps(scene, camera, spp=256)
+        seen = maps["coverage"]
+        specular, alpha = (
+            x if x.ndim == 2 else x[..., 0]
+            for x in (truth.picture(k, name) for k in ("specular_albedo", "specular_roughness"))
+        )
+        normal = truth.folder / "truth" / "normal" / f"{name}.exr"
+        yield FlashView(
+            name,
+            picture[..., :3],
+            truth.picture("image", name)[..., :3],
+            seen,
+            (
+                maps["diffuse"] * seen[..., None] * ratio,
+                truth.picture("diffuse_albedo", name)[..., :3],
+            ),
+            (maps["specular"] * seen * ratio, specular),
+            (maps["alpha"] * seen, alpha),
+            (maps["normal"], read_data(normal)) if normal.is_file() else None,
+        )
 
 
 def view_figures(
-    scene,
-    asset: Asset,
-    truth: FlashTruth,
-    name: str,
-    camera: Camera,
-    ratio: float,
-    spp: int,
-    seed: int,
+    view: FlashView, constants: Constants, lpips: Lpips | None = None
 ) -> dict[str, float]:
-    """All figures of one test view."""
-    from relit.reference.flash_scene import render_flash, render_maps
-    from relit.reference.photographed import FLASH_DEPTH
-
-    picture = render_flash(scene, camera, asset.flash, spp, seed=seed, max_depth=FLASH_DEPTH)[
-        ..., :3
-    ]
-    maps = render_maps(
-        scene, camera, spp=256
-    )  # primary rays alone; fewer leave noise at outlines that costs half a dB
-    a, b = m.encode(picture), m.encode(truth.picture("image", name)[..., :3])
-    seen = maps["coverage"][..., None]
-    diffuse, specular = (
-        truth.picture(folder, name) for folder in ("diffuse_albedo", "specular_albedo")
-    )
-    alpha = truth.picture("specular_roughness", name)
-    specular, alpha = (x if x.ndim == 2 else x[..., 0] for x in (specular, alpha))
-    out = {"novel_psnr": m.psnr(a, b), "novel_ssim": m.ssim(a, b)}
-    albedo = {
-        "diffuse": (maps["diffuse"] * seen * ratio, diffuse[..., :3]),
-        "specular": (maps["specular"] * seen[..., 0] * ratio, specular),
+    """All figures of one test view; its truth is added to `constants`. Figures inside the mask need
+    the truth's normals, whose coverage is the mask."""
+    coverage = None if view.normals is None else view.normals[1][..., 3]
+    inside = np.zeros(view.coverage.shape, bool) if coverage is None else coverage >= m.MASK
+    figures = picture_figures(view.picture, view.photo, inside, lpips)
+    out = {
+        f"novel_{key}": value
+        for key, value in figures.items()
+        if coverage is not None or not key.endswith("_masked")
     }
-    difference = np.square(maps["alpha"] * seen[..., 0] - alpha)
-    for key, pair in albedo.items():
-        out[f"{key}_psnr"] = m.psnr(*pair)
+    # where no mask is known the object is where its albedo is not black
+    shape = (view.diffuse[1].max(-1) > 0) if coverage is None else coverage
+    for key, (mine, true) in (("diffuse", view.diffuse), ("specular", view.specular)):
+        out[f"{key}_psnr"] = m.psnr(mine, true)
+        constants.add(f"{key}_psnr", true, coverage=shape)
+        if coverage is not None:
+            out[f"{key}_psnr_masked"] = m.psnr(mine, true, inside)
+            constants.add(f"{key}_psnr_masked", true, inside)
+    difference = np.square(view.alpha[0] - view.alpha[1])
     out["roughness_mse"] = float(difference.mean())
-    normal = truth.folder / "truth" / "normal" / f"{name}.exr"
-    if normal.is_file():
-        from relit.images import read_data
-
-        true = read_data(normal)
-        inside = true[..., 3] >= m.MASK
-        out["novel_psnr_masked"] = m.psnr(a, b, inside)
-        for key, pair in albedo.items():
-            out[f"{key}_psnr_masked"] = m.psnr(*pair, inside)
+    constants.add("roughness_mse", view.alpha[1], coverage=shape)
+    if view.normals is not None:
         out["roughness_mse_masked"] = float(difference[inside].mean())
-        out["normal_mae"] = float(m.normal_angles(maps["normal"], true[..., :3])[inside].mean())
+        constants.add("roughness_mse_masked", view.alpha[1], inside)
+        angles = m.normal_angles(view.normals[0], view.normals[1][..., :3])
+        out["normal_mae"] = float(angles[inside].mean())
     return out

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 from relit.conventions import environment_solid_angles
@@ -37,28 +37,56 @@ DEFINITIONS = {
 }
 
 
-def ssim_map(a, b) -> np.ndarray:
+def gamma_encode(linear):
+    """Linear -> clipped to [0, 1], to the power 1/2.2: how SfD and PIR encode pictures."""
+    return np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
+
+
+def ssim_map(a, b, radius: int = SSIM_RADIUS) -> np.ndarray:
     """Structural similarity (H, W) of two (H, W) or (H, W, C) arrays in [0, 1], mean over channels.
 
-    Wang et al. 2004, Eq. 13: Gaussian window of 11 x 11 pixels with sigma 1.5, C1 = .01^2, C2 =
-    .03^2, population moments, frame edges reflected.
+    Wang et al. 2004, Eq. 13: Gaussian window of (2 radius + 1)^2 pixels with sigma 1.5, C1 =
+    .01^2, C2 = .03^2, population moments, frame edges reflected.
     """
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    if a.ndim == 2:
-        a, b = a[..., None], b[..., None]
 
     def blur(x):
         return gaussian_filter(
-            x, (SSIM_SIGMA, SSIM_SIGMA, 0), radius=(SSIM_RADIUS, SSIM_RADIUS, 0), mode="reflect"
+            x, (SSIM_SIGMA, SSIM_SIGMA, 0), radius=(radius, radius, 0), mode="reflect"
         )
 
+    return _structural_similarity(a, b, blur).mean(-1)
+
+
+def ssim_uniform(
+    a, b, size: int, data_range: float = 1.0, sample_covariance: bool = False
+) -> float:
+    """Structural similarity with a uniform window of size^2 pixels, mean over channels and over the
+    pixels whose window lies in the frame: scikit-image without `gaussian_weights`, as SfD (7,
+    sample covariance) and PIR (11) call it."""
+    pad, count = (size - 1) // 2, size * size
+
+    def blur(x):
+        return uniform_filter(x, (size, size, 0))
+
+    norm = count / (count - 1) if sample_covariance else 1.0
+    s = _structural_similarity(a, b, blur, data_range, norm)
+    return float(s[pad:-pad, pad:-pad].mean())
+
+
+def _structural_similarity(a, b, blur, data_range: float = 1.0, norm: float = 1.0) -> np.ndarray:
+    """(H, W, C) map. blur: weighted mean over the window. norm: factor of the covariances."""
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if a.ndim == 2:
+        a, b = a[..., None], b[..., None]
     mu_a, mu_b = blur(a), blur(b)
-    var_a, var_b, cov = blur(a * a) - mu_a**2, blur(b * b) - mu_b**2, blur(a * b) - mu_a * mu_b
-    c1, c2 = 0.01**2, 0.03**2
-    s = ((2 * mu_a * mu_b + c1) * (2 * cov + c2)) / (
+    var_a, var_b, cov = (
+        norm * (blur(x * y) - mx * my)
+        for x, y, mx, my in ((a, a, mu_a, mu_a), (b, b, mu_b, mu_b), (a, b, mu_a, mu_b))
+    )
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    return ((2 * mu_a * mu_b + c1) * (2 * cov + c2)) / (
         (mu_a**2 + mu_b**2 + c1) * (var_a + var_b + c2)
     )
-    return s.mean(-1)
 
 
 def ssim(a, b, where=None) -> float:
@@ -81,8 +109,8 @@ def normal_angles(predicted, truth) -> np.ndarray:
 
 def albedo_scale(predicted, truth) -> np.ndarray:
     """Per-channel factor (3,) that takes the predicted albedo to the true one: sum(truth) /
-    sum(predicted) over (N, 3) linear samples (SfD's evaluation, there in gamma space). Albedo and
-    light share a scale that photographs cannot settle."""
+    sum(predicted) over (N, 3) samples, linear in Relit's own figures, after x^(1/2.2) in SfD's.
+    Albedo and light share a scale that photographs do not determine."""
     p, t = (
         np.asarray(predicted, np.float64).reshape(-1, 3),
         np.asarray(truth, np.float64).reshape(-1, 3),
@@ -101,6 +129,11 @@ class SurfacePoints:
     triangle: np.ndarray
     uniform: np.ndarray
     corners: np.ndarray
+
+    @property
+    def samples(self) -> np.ndarray:
+        """(N, 3) the points that are uniform by area."""
+        return self.points[self.uniform]
 
     def only(self, keep) -> SurfacePoints:
         """The points where `keep` (N,) is true."""
@@ -171,8 +204,17 @@ def distance_to_surface(points, surface: SurfacePoints, candidates: int = 8) -> 
 def chamfer(a: SurfacePoints, b: SurfacePoints) -> tuple[float, float, float]:
     """(mean of the two, a to b, b to a): mean distance from the samples of each surface to the
     other surface. Not squared."""
+    to_b, to_a = (float(distance_to_surface(x.samples, y).mean()) for x, y in ((a, b), (b, a)))
+    return 0.5 * (to_a + to_b), to_b, to_a
+
+
+def point_chamfer(a, b, squared: bool = False) -> tuple[float, float, float]:
+    """(mean of the two, a to b, b to a): mean distance, or squared distance, from each of the
+    points (N, 3) to the nearest of the other points (M, 3). Two sets of samples of one surface do
+    not reach 0, but about half the spacing of the samples."""
+    power = 2 if squared else 1
     to_b, to_a = (
-        float(distance_to_surface(x.points[x.uniform], y).mean()) for x, y in ((a, b), (b, a))
+        float((cKDTree(y).query(x, workers=-1)[0] ** power).mean()) for x, y in ((a, b), (b, a))
     )
     return 0.5 * (to_a + to_b), to_b, to_a
 
@@ -189,10 +231,17 @@ def resize_environment(environment, height: int = 256, width: int = 512) -> np.n
     )
 
 
-def environment_mse(predicted, truth) -> float:
-    """SfD's figure: MSE of two lat-long maps resampled to 256 x 512, clipped to [0, 1] and raised
-    to 1/2.2, every texel alike."""
-    p, t = (np.clip(resize_environment(e), 0, 1) ** (1 / 2.2) for e in (predicted, truth))
+def encoded_environment(environment, upper: bool = False) -> np.ndarray:
+    """Lat-long map resampled to 256 x 512, clipped to [0, 1] and raised to 1/2.2. upper: only the
+    rows of directions above the horizon (+y), (128, 512, 3)."""
+    encoded = gamma_encode(resize_environment(environment))
+    return encoded[: len(encoded) // 2] if upper else encoded
+
+
+def environment_mse(predicted, truth, upper: bool = False) -> float:
+    """SfD's figure: MSE of two lat-long maps as `encoded_environment` gives them, every texel
+    alike."""
+    p, t = (encoded_environment(e, upper) for e in (predicted, truth))
     return float(np.mean((p - t) ** 2))
 
 

@@ -19,6 +19,8 @@ from relit.conventions import sample_environment
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.alignment import aligned, pose_errors
+from relit.evaluate.lpips import Lpips
+from relit.evaluate.picture_figures import LPIPS, Draw, picture_figures
 from relit.evaluate.results import entries
 from relit.evaluate.truth import camera_key
 from relit.files import parse_toml
@@ -34,7 +36,10 @@ _FIGURES = {
         "dB",
         f"PSNR in dB of sRGB-encoded pictures clipped to [0, 1], over the pixels whose mask is >= {m.MASK}",
     ),
+    "ssim": ("", f"{m.DEFINITIONS['ssim']}; the photo is multiplied with its mask"),
     "ssim_masked": ("", f"{m.DEFINITIONS['ssim_masked']} (coverage is the photo's mask)"),
+    "lpips": ("", f"{LPIPS['lpips']}; the photo is multiplied with its mask"),
+    "lpips_masked": ("", f"{LPIPS['lpips_masked']} (coverage is the photo's mask)"),
     "mask_iou": (
         "",
         "intersection over union of the asset's coverage and the photo's mask, both >= .5",
@@ -49,6 +54,9 @@ _FIGURES = {
         f"PSNR in dB of sRGB-encoded pictures clipped to [0, 1], over the pixels that the asset itself covers (>= {m.MASK}) and whose ray "
         "meets the object sphere; read it together with `covered`",
     ),
+    "ssim_sphere": ("", "the SSIM map of the pictures of psnr_sphere, over the same pixels"),
+    "ssim_covered": ("", "the SSIM map of the pictures of psnr_sphere, over those of psnr_covered"),
+    "lpips_sphere": ("", "LPIPS of the pictures of psnr_sphere, black beside the object sphere"),
     "covered": ("", f"share of the object sphere's pixels that the asset covers (>= {m.MASK})"),
 }
 
@@ -69,7 +77,13 @@ def definitions(prefix: str, light: str = "recovered light") -> dict[str, tuple[
 
 
 def evaluate_on_photos(
-    asset: Asset, folder: Path, *, run: Path | None = None, spp: int = 256, seed: int = 0
+    asset: Asset,
+    folder: Path,
+    *,
+    run: Path | None = None,
+    spp: int = 256,
+    seed: int = 0,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """The figures of an asset against the photos of its capture. run: the run folder, whose
     settings say how the capture was read.
@@ -101,7 +115,7 @@ def evaluate_on_photos(
     photos, prefix = chosen(capture)
     show = as_photographed(asset)
     per_view = {
-        p.name: photo_figures(show, asset, p, capture.sphere, spp, seed + i)
+        p.name: photo_figures(show, asset, p, capture.sphere, Draw(spp, seed + i, lpips))
         for i, p in enumerate(photos)
     }
     names = [n for n in _FIGURES if any(n in v for v in per_view.values())]
@@ -144,23 +158,19 @@ def chosen(capture: Capture) -> tuple[list[Photo], str]:
 
 
 def photo_figures(
-    show, asset: Asset, photo: Photo, sphere: Sphere | None, spp: int, seed: int
+    show, asset: Asset, photo: Photo, sphere: Sphere | None, draw: Draw
 ) -> dict[str, float]:
     """Figures of one photo, without prefix: the masked ones where its mask is known, else those of
     the object sphere. show: see `reference.photographed.as_photographed`."""
     pixels, camera = photo.load(), photo.camera
     camera = camera.within(SIDE)
     rgb, mask = (shrunk_to_camera(a, camera) for a in (pixels.rgb, pixels.mask))
-    shown = show(photo.name, camera, spp=spp, seed=seed)
+    shown = show(photo.name, camera, spp=draw.spp, seed=draw.seed)
     alpha = shown[..., 3]
     if mask is not None:
-        a, b, inside = m.encode(shown[..., :3]), m.encode(rgb * mask[..., None]), mask >= m.MASK
-        return {
-            "psnr": m.psnr(a, b),
-            "psnr_masked": m.psnr(a, b, inside),
-            "ssim_masked": float(m.ssim_map(a, b)[inside].mean()) if inside.any() else float("nan"),
-            "mask_iou": m.mask_iou(alpha, mask),
-        }
+        inside = mask >= m.MASK
+        figures = picture_figures(shown[..., :3], rgb * mask[..., None], inside, draw.lpips)
+        return figures | {"mask_iou": m.mask_iou(alpha, mask)}
     d = directions(camera)
     behind = (
         0.0
@@ -170,12 +180,17 @@ def photo_figures(
     a, b = m.encode(shown[..., :3] + behind), m.encode(rgb)
     ball = np.ones(alpha.shape, bool) if sphere is None else meets_sphere(camera, d, sphere)
     covered = ball & (alpha >= m.MASK)
-    share = float(covered.sum() / max(ball.sum(), 1))
-    return {
+    s = m.ssim_map(a, b)
+    out = {
         "psnr_sphere": m.psnr(a, b, ball),
         "psnr_covered": m.psnr(a, b, covered),
-        "covered": share,
+        "ssim_sphere": float(s[ball].mean()) if ball.any() else float("nan"),
+        "ssim_covered": float(s[covered].mean()) if covered.any() else float("nan"),
+        "covered": float(covered.sum() / max(ball.sum(), 1)),
     }
+    if draw.lpips is not None:
+        out["lpips_sphere"] = draw.lpips(a * ball[..., None], b * ball[..., None])
+    return out
 
 
 def shrunk_to_camera(image: np.ndarray | None, camera: Camera) -> np.ndarray | None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from relit.conventions import move_points, scale_of, similarity
-from relit.geometry.se3 import nearest_rotation, rotation_angle
+from relit.evaluate.alignment import angles_between
+from relit.geometry.se3 import nearest_rotation
 from relit.scene import Camera
 
 GUESSED = 0.1  # weight of a first guess beside one instance
@@ -23,7 +24,7 @@ def object_turn(poses: dict, true_poses: dict) -> np.ndarray:
             for k in poses
         ]
     )
-    angles = np.array([[rotation_angle(a.T @ b) for b in turns] for a in turns])
+    angles = angles_between(turns[:, None], turns[None])
     middle = int(np.argmin(np.median(angles, axis=1)))
     near = angles[middle] <= max(3 * float(np.median(angles[middle])), 1.0)
     return nearest_rotation(turns[near].sum(0))
@@ -35,7 +36,8 @@ def scene_alignment(
     """Of poses world_from_object (4, 4) by label and their truth: the scale about the camera that
     carries the recovered scene onto the true one; the point (3,) of the recovered object's frame
     that is the middle of the true one (`scale_about`); and object_from_true_object (4, 4) with the
-    turn of `object_turn`, refined between the surfaces (ICP). vertices: of the recovered object."""
+    turn of `object_turn`, refined between the surfaces (ICP). vertices: of the recovered object.
+    Without the refinement: `frame_by_poses`."""
     turn = object_turn(poses, true_poses)
     middle = (true_points.min(0) + true_points.max(0)) / 2
     own = (vertices.min(0) + vertices.max(0)) / 2
@@ -43,6 +45,21 @@ def scene_alignment(
     frame = similarity(turn, own - size * turn @ middle, size)
     frame = icp(true_points[::10], vertices.astype(np.float64), frame)
     return *scale_about(photo.centre, poses, true_poses, middle, move_points(frame, middle)), frame
+
+
+def frame_by_poses(
+    poses: dict, true_poses: dict, scale: float, own: np.ndarray, middle: np.ndarray
+) -> np.ndarray:
+    """object_from_true_object (4, 4) from the poses alone, as SfD's `blender_align`: the camera
+    fixes all but one scale, the poses fix that, and no surface is consulted, so an error of the
+    poses stays in what is measured after it. scale, own: of `scale_about`. middle: (3,) of the true
+    object."""
+    turn = object_turn({k: p for k, p in poses.items() if k in true_poses}, true_poses)
+    sizes = [
+        scale_of(true_poses[k]) / (scale * scale_of(poses[k])) for k in poses if k in true_poses
+    ]
+    size = float(np.median(sizes))
+    return similarity(turn, own - size * turn @ middle, size)
 
 
 def scale_about(

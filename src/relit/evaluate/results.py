@@ -2,21 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from relit.evaluate.baselines import Baselines
+
+
+@dataclass(frozen=True)
+class PaperValue:
+    """A published value of a figure. value: as printed. where: paper and table, with what differs.
+    rerun: the same figure in the authors' own later run, where known."""
+
+    value: float
+    where: str
+    rerun: float | None = None
+
 
 def entries(
-    values: dict[str, float], definitions: dict[str, tuple[str, str]]
+    values: Mapping[str, float],
+    definitions: Mapping[str, tuple[str, str]],
+    baselines: Baselines | None = None,
+    papers: Mapping[str, PaperValue] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """{name: {"value", "unit", "definition"}} of those figures that are defined, in the order of
-    their definitions (unit, sentence)."""
-    known = ((name, *definitions[name]) for name in definitions if name in values)
-    return {
-        name: {"value": float(values[name]), "unit": unit, "definition": definition}
-        for name, unit, definition in known
-    }
+    their definitions (unit, sentence).
+
+    Where they are known: "baseline" with "baseline_definition"; "paper" with "paper_where", and
+    "rerun", the authors' own later run.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    for name, (unit, definition) in definitions.items():
+        if name not in values:
+            continue
+        out[name] = {"value": float(values[name]), "unit": unit, "definition": definition}
+        if baselines and name in baselines:
+            value, text = baselines[name]
+            out[name] |= {"baseline": float(value), "baseline_definition": text}
+        if papers and name in papers:
+            paper = papers[name]
+            out[name] |= {"paper": paper.value, "paper_where": paper.where}
+            if paper.rerun is not None:
+                out[name]["rerun"] = paper.rerun
+    return out
 
 
 def view_means(per_view: dict[str, dict[str, float]]) -> dict[str, float]:
@@ -29,17 +59,33 @@ def view_means(per_view: dict[str, dict[str, float]]) -> dict[str, float]:
     return {key: float(np.mean(values)) for key, values in gathered.items()}
 
 
+COLUMNS = {"baseline": "baseline", "paper": "paper", "rerun": "re-run"}  # key of an entry -> head
+
+
 def figures_table(result: dict[str, Any], title: str = "", definitions: bool = True):
-    """A rich Table of the figures, with what each means."""
+    """A rich Table of the figures with what each means: the baseline, the paper's value and the
+    authors' re-run beside it where a figure has one."""
     from rich.table import Table
 
+    metrics = result["metrics"]
+    extra = [key for key in COLUMNS if any(key in entry for entry in metrics.values())]
     out = Table(title=title or None)
     out.add_column("figure")
     out.add_column("value", justify="right")
+    for key in extra:
+        out.add_column(COLUMNS[key], justify="right")
     out.add_column("unit")
     if definitions:
         out.add_column("definition", overflow="fold")
-    for name, entry in result["metrics"].items():
-        row = [name, f"{entry['value']:.4g}", entry["unit"]]
-        out.add_row(*row, *([entry["definition"]] if definitions else []))
+    for name, entry in metrics.items():
+        row = [name, f"{entry['value']:.4g}"]
+        row += [f"{entry[key]:.4g}" if key in entry else "" for key in extra]
+        row.append(entry["unit"])
+        text = entry["definition"]
+        if "paper_where" in entry:
+            text += f". Paper: {entry['paper_where']}"
+        out.add_row(*row, *([text] if definitions else []))
+    if "baseline" in extra:
+        texts = dict.fromkeys(e["baseline_definition"] for e in metrics.values() if "baseline" in e)
+        out.caption = "Baseline: " + "; or ".join(texts) + "."
     return out

@@ -9,6 +9,7 @@ import numpy as np
 
 from relit.evaluate import metrics as m
 from relit.evaluate.definitions import ROUNDTRIP_SIDE, ROUNDTRIP_SPP, ROUNDTRIP_VIEWS
+from relit.evaluate.picture_figures import picture_figures
 from relit.scene import Asset, Camera
 
 
@@ -31,23 +32,26 @@ def write_own_renders(folder: str | Path, asset: Asset) -> None:
         write_linear(Path(folder) / f"own_{i:04d}.exr", picture)
 
 
-def glb_roundtrip(asset: Asset, folder: str | Path) -> float | None:
-    """Mean PSNR of an asset that was read back from its folder against the pictures of
-    `write_own_renders` in `folder`: the same views, light and random numbers. None where there are
-    no such pictures."""
+def glb_roundtrip(asset: Asset, folder: str | Path) -> dict[str, float]:
+    """The glb_roundtrip figures, means over views, of an asset that was read back from its folder
+    against the pictures of `write_own_renders` in `folder`: the same views, light and random
+    numbers. {} where there are no such pictures."""
     from relit.images import read_data
     from relit.reference.mitsuba_scene import build_scene, render
 
     files = sorted(Path(folder).glob("own_*.exr"))
     if not files or asset.environment is None:
-        return None
+        return {}
     scene = build_scene(asset.mesh, asset.material, asset.world_from_asset, asset.environment)
-    values = []
+    found = []
     for file in files:
         i = int(file.stem.removeprefix("own_"))
-        picture = render(scene, _small(asset.cameras[i][1]), spp=ROUNDTRIP_SPP, seed=i)
-        values.append(m.psnr(m.encode(picture[..., :3]), m.encode(read_data(file)[..., :3])))
-    return float(np.mean(values))
+        picture, own = (
+            render(scene, _small(asset.cameras[i][1]), spp=ROUNDTRIP_SPP, seed=i),
+            read_data(file),
+        )
+        found.append(picture_figures(picture[..., :3], own[..., :3], own[..., 3] >= m.MASK))
+    return {f"glb_roundtrip_{k}": float(np.nanmean([f[k] for f in found])) for k in found[0]}
 
 
 def _small(camera: Camera) -> Camera:
