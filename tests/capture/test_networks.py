@@ -10,7 +10,8 @@ import trimesh
 from relit.capture.networks import MEAN, SPREAD, Network, found_instances, predicted_normals
 from relit.conventions import similarity
 from relit.errors import UserError
-from relit.evaluate.duplicates import photo_figure
+from relit.evaluate.duplicates import photo_figures_of
+from relit.evaluate.picture_figures import Draw
 from relit.job import Job, open_as
 from relit.scene import Asset, Camera, Instance, Material, Mesh
 from support.tiny_onnx import write_pointwise
@@ -72,10 +73,10 @@ def test_a_run_with_a_segmenter_is_measured_by_its_labels(tmp_path, device):
         instances=instances,
     )
     with pytest.raises(UserError, match="no photo of duplicates"):
-        photo_figure(asset, path, run=tmp_path / "run", spp=4)
+        photo_figures_of(asset, path, Draw(4), run=tmp_path / "run")
     (tmp_path / "run" / "config.toml").write_text(f'masks = "segment:{network}"\n')
     assert (
-        3 < photo_figure(asset, path, run=tmp_path / "run", spp=4) < 20
+        3 < photo_figures_of(asset, path, Draw(4), run=tmp_path / "run")["photo_psnr"] < 20
     )  # a grey ball where a red and a blue disc are
 
 

@@ -7,12 +7,16 @@ from scipy.spatial.transform import Rotation
 from relit.conventions import move_points, move_pose, similarity
 from relit.errors import UserError
 from relit.evaluate.alignment import (
+    align_centres,
     align_named_cameras,
     align_points,
     angle_between,
+    angles_between,
     pose_errors,
     same_frame,
 )
+from relit.geometry.se3 import exp_so3, look_at
+from relit.scene import Camera
 from relit.synthesize.multiview import orbit_cameras
 
 KNOWN = similarity(
@@ -73,3 +77,68 @@ def test_rotation_angle_is_exact_near_zero():
     turn = Rotation.from_rotvec([0, 0, 1e-5]).as_matrix()
     assert angle_between(np.eye(3), turn) == pytest.approx(np.degrees(1e-5), rel=1e-6)
     assert angle_between(np.eye(3), np.diag([1.0, -1, -1])) == pytest.approx(180)
+
+
+# ---------------------------------------------------------------- Procrustes on centres
+
+
+def around(count=8):
+    rng = np.random.default_rng(3)
+    eyes = rng.normal(size=(count, 3))
+    return {
+        f"{i}": Camera(40, 30, 50.0, 50.0, 20.0, 15.0, look_at(4 * eye / np.linalg.norm(eye)))
+        for i, eye in enumerate(eyes)
+    }
+
+
+def test_centres_alone_fix_the_similarity():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(9, 3))
+    s = similarity(exp_so3(np.array([0.3, -0.8, 0.5])), [1.0, 2, 3], 2.5)
+    y = move_points(s, x)
+    np.testing.assert_allclose(align_centres(x, y), s, atol=1e-9)
+    y[4] += 20  # one camera lost
+    np.testing.assert_allclose(align_centres(x, y), s, atol=1e-9)
+    assert np.abs(align_centres(x, y, robust=False) - s).max() > 0.1
+    with pytest.raises(UserError, match="on a line"):
+        align_centres(x[:, :1] * [1, 2, 3], x)
+
+
+def test_orientations_that_are_all_off_alike_are_seen_after_procrustes_on_centres():
+    """A fit of the orientations themselves would hide this error."""
+    from relit.evaluate.collection import camera_pose_figures
+
+    true = around()
+    tilt = np.eye(4)
+    tilt[:3, :3] = exp_so3(np.radians([0, 11, 0]))
+    # every camera turned by 11 degrees about the WORLD's y, its centre kept
+    found = {}
+    for name, camera in true.items():
+        pose = camera.world_from_camera.copy()
+        pose[:3, :3] = tilt[:3, :3] @ pose[:3, :3]
+        found[name] = camera.with_pose(pose)
+    del found["7"]  # and one photo without a camera
+    values, _ = camera_pose_figures(found, true, {})
+    assert values["rotation_mean"] == pytest.approx(11) and values["cameras"] == 87.5
+    assert values["rotation_median"] == pytest.approx(11) and values["rotation_within_10"] == 0
+    assert values["translation_percent"] == pytest.approx(0, abs=1e-6)
+    few = {n: found[n] for n in "012"}
+    assert camera_pose_figures(few, true, {})[0]["rotation_median"] == 180
+
+
+def test_chance_of_cameras_is_that_of_random_rotations():
+    from relit.evaluate.collection import camera_chance
+
+    true = around(24)
+    baselines = camera_chance(true, true, {})
+    assert 105 < baselines["rotation_mean"][0] < 132 and baselines["translation_percent"][0] > 60
+    assert camera_chance(true, true, {}) == baselines  # a fixed seed
+
+
+def test_angles_of_stacks_are_those_of_pairs():
+    rng = np.random.default_rng(5)
+    a, b = (np.array([exp_so3(rng.normal(size=3) * 2) for _ in range(6)]) for _ in range(2))
+    expected = [angle_between(x, y) for x, y in zip(a, b, strict=True)]
+    np.testing.assert_allclose(angles_between(a, b), expected, atol=1e-6)
+    half = exp_so3(np.array([0, np.pi, 0]))
+    assert angles_between(np.eye(3), half) == pytest.approx(180)

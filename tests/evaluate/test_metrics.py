@@ -145,3 +145,46 @@ def test_mask_iou():
     a, b = np.zeros((4, 4)), np.zeros((4, 4))
     a[:2], b[1:3] = 1.0, 1.0
     assert m.mask_iou(a, b) == pytest.approx(4 / 12)
+
+
+def test_ssim_with_a_uniform_window_agrees_with_scikit_image():
+    from skimage.metrics import structural_similarity
+
+    rng = np.random.default_rng(2)
+    a = rng.random((30, 34, 3))
+    b = np.clip(a + 0.2 * rng.normal(size=a.shape), 0, 1)
+    pir = structural_similarity(
+        a, b, data_range=1.0, win_size=11, sigma=1.5, use_sample_covariance=False, channel_axis=2
+    )
+    assert m.ssim_uniform(a, b, 11) == pytest.approx(pir, abs=1e-9)
+    sfd = structural_similarity(a, b, data_range=0.8, channel_axis=2)
+    assert m.ssim_uniform(a, b, 7, 0.8, True) == pytest.approx(sfd, abs=1e-9)
+
+
+def test_points_of_two_parallel_lines_are_as_far_apart_as_the_lines():
+    a = np.array([[0, 0, 0], [1, 0, 0]], float)
+    b = np.array([[0, 2, 0], [1, 2, 0], [5, 2, 0]], float)
+    mean, to_b, to_a = m.point_chamfer(a, b)
+    assert to_b == 2 and to_a == pytest.approx((2 + 2 + np.sqrt(20)) / 3)
+    assert mean == pytest.approx((to_a + to_b) / 2)
+    assert m.point_chamfer(a, b, squared=True)[1:] == pytest.approx((4, (4 + 4 + 20) / 3))
+
+
+def test_samples_of_a_surface_are_uniform_by_area():
+    """A square of one large triangle and many small ones: the halves get equal shares."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
+    edge = np.linspace([1, 0, 0], [0, 1, 0], 101)
+    vertices = np.concatenate([vertices, edge])
+    fan = [[3, 4 + i, 5 + i] for i in range(100)]
+    surface = m.sample_surface(vertices, np.array([[0, 1, 2], *fan]), 4000)
+    assert surface.samples.shape == (4000, 3) and len(surface.points) == 4101
+    assert (surface.samples[:, :2].sum(1) < 1).mean() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_upper_half_of_a_light_is_compared_alone():
+    truth = np.full((256, 512, 3), 0.25)
+    filled = truth.copy()
+    filled[128:] = 1.0
+    assert m.environment_mse(filled, truth, upper=True) == pytest.approx(0, abs=1e-12)
+    whole = (1 - 0.25 ** (1 / 2.2)) ** 2 / 2
+    assert m.environment_mse(filled, truth) == pytest.approx(whole, rel=1e-5)

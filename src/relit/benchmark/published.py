@@ -1,26 +1,34 @@
-"""Values that papers print for the figures of the suites: (value as printed, where)."""
+"""Values that papers print for the figures of the suites. Each is under the paper's own protocol
+(`relit evaluate --protocol`), on the paper's own captures."""
 
 from __future__ import annotations
 
-PUBLISHED: dict[str, dict[str, tuple[str, str]]] = {
-    "multiview": {
-        "relit_psnr": ("31.84", "PTIR-GS, TensoIR-synthetic"),
-    },
+from relit.evaluate.protocols import pir, samurai, sfd
+from relit.evaluate.results import PaperValue
+
+_FLASH, _PILE = pir.PAPERS["offset"], sfd.PAPERS["duplicates"]
+PUBLISHED: dict[str, dict[str, PaperValue]] = {
+    "multiview": {"relit_psnr": PaperValue(31.84, "PTIR-GS, TensoIR-synthetic")},
     "flash": {
-        "novel_psnr": ("31.89", "PIR Tab. 2"),
-        "diffuse_psnr": ("35.78", "PIR Tab. 2"),
-        "specular_psnr": ("29.72", "PIR Tab. 2"),
-        "roughness_mse": (".00088", "PIR Tab. 2"),
+        figure: _FLASH[figure]
+        for figure in ("novel_psnr", "diffuse_psnr", "specular_psnr", "roughness_mse")
     },
-    "collection": {
-        "novel_psnr": ("23.46", "SAMURAI Tab. 1"),
-    },
+    "collection": {figure: samurai.PAPERS[figure] for figure in ("novel_psnr", "rotation_mean")},
     "duplicates": {
-        "rotation_median": (".19", "SfD Tab. 2, N = 10"),
-        "albedo_psnr": ("17.63", "SfD Tab. 1; re-run 17.28"),
-        "relit_psnr": ("21.37", "SfD Tab. 1"),
-        "roughness_mse": (".062", "SfD Tab. 1; re-run .070"),
-        "environment_mse": (".052", "SfD Tab. 1; re-run .137"),
-        "chamfer": (".034", "SfD Tab. 1"),
+        "rotation_median": _PILE["rotation_mean"],
+        **{
+            figure: _PILE[figure]
+            for figure in (
+                *("albedo_psnr", "relit_psnr", "roughness_mse", "environment_mse", "chamfer"),
+            )
+        },
     },
 }
+
+
+def published_text(paper: PaperValue | None) -> str:
+    """A cell of a table."""
+    if paper is None:
+        return "-"
+    rerun = "" if paper.rerun is None else f"; re-run {paper.rerun:g}"
+    return f"{paper.value:g} ({paper.where}{rerun})"

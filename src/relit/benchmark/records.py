@@ -29,8 +29,9 @@ class Record:
     """Figures of one run over a suite.
 
     runs: {variant: {object: {figure: value}}}; the variant 'plain' has nothing switched off.
-    failed: {variant: {object: reason}}. definitions: {figure: (unit, sentence)}. commit: of the
-    code, or its version outside a repository. source: 'measured', or where the figures were
+    failed: {variant: {object: reason}}. definitions: {figure: (unit, sentence)}. baselines: as
+    runs, the best constant's or chance's score of those figures that have one. ceilings: {object:
+    {light: {figure: value}}}, the true asset in our renderer. commit: of the code, or its version outside a repository. source: 'measured', or where the figures were
     transcribed from. options: of the run, as on the command line.
     """
 
@@ -42,6 +43,8 @@ class Record:
     runs: Mapping[str, Mapping[str, Mapping[str, float]]]
     failed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     definitions: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    baselines: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+    ceilings: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
     device: str = "cpu"
     dirty: bool = False
     date: str = ""
@@ -93,12 +96,19 @@ def record_of(result: Mapping[str, Any], options: Mapping[str, Any]) -> Record:
     """A Record of what `run_suite` returns."""
     commit, dirty = state_of_code()
     runs: dict[str, dict[str, dict[str, float]]] = {}
+    baselines: dict[str, dict[str, dict[str, float]]] = {}
+    ceilings: dict[str, dict[str, dict[str, float]]] = {}
     definitions: dict[str, tuple[str, str]] = {}
     for variant, objects in result["runs"].items():
-        runs[variant] = {}
+        runs[variant], baselines[variant] = {}, {}
         for name, entry in objects.items():
             metrics = entry["metrics"]
             runs[variant][name] = {figure: m["value"] for figure, m in metrics.items()}
+            baselines[variant][name] = {
+                figure: m["baseline"] for figure, m in metrics.items() if "baseline" in m
+            }
+            if entry.get("ceiling"):
+                ceilings[name] = entry["ceiling"]
             definitions.update({f: (m["unit"], m["definition"]) for f, m in metrics.items()})
     return Record(
         result["suite"],
@@ -109,6 +119,8 @@ def record_of(result: Mapping[str, Any], options: Mapping[str, Any]) -> Record:
         runs,
         result["failed"],
         definitions,
+        baselines,
+        ceilings,
         device=result["device"],
         dirty=dirty,
         date=time.strftime("%Y-%m-%d"),

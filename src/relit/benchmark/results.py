@@ -18,6 +18,17 @@ def means(runs: dict[str, dict]) -> dict[str, float]:
     return {k: float(np.mean([first[k]["value"], *(r[k]["value"] for r in rest)])) for k in names}
 
 
+def baseline_means(runs: dict[str, dict]) -> dict[str, float]:
+    """Mean over objects of the baseline of every figure that has one in all of them."""
+    entries = [r["metrics"] for r in runs.values()]
+    names = [
+        k
+        for k in (entries[0] if entries else {})
+        if all("baseline" in e.get(k, {}) for e in entries)
+    ]
+    return {k: float(np.mean([e[k]["baseline"] for e in entries])) for k in names}
+
+
 def verdict(bar: Bar | None, value: float) -> str:
     """'' without a bar, 'met', or by how much a mean misses its bar."""
     if bar is None:
@@ -41,9 +52,10 @@ def markdown(result: dict[str, Any], suite: Suite) -> str:
         lines += [f"### {variant}", ""]
         if runs:
             lines += [
-                f"| figure | unit | {' | '.join(runs)} | mean | bar | |",
-                "|---" * (len(runs) + 5) + "|",
+                f"| figure | unit | {' | '.join(runs)} | mean | baseline | bar | |",
+                "|---" * (len(runs) + 6) + "|",
             ]
+        baselines = baseline_means(runs)
         for figure in means(runs):
             values = " | ".join(f"{r['metrics'][figure]['value']:.4g}" for r in runs.values())
             bar, unit = (
@@ -52,8 +64,10 @@ def markdown(result: dict[str, Any], suite: Suite) -> str:
             )
             mean = result["means"][variant].get(figure)
             told = ("", "") if mean is None else (f"{mean:.4g}", verdict(bar, mean))
+            base = f"{baselines[figure]:.4g}" if figure in baselines else ""
             lines.append(
-                f"| {figure} | {unit} | {values} | {told[0]} | {bar_text(bar)} | {told[1]} |"
+                f"| {figure} | {unit} | {values} | {told[0]} | {base} | {bar_text(bar)} "
+                f"| {told[1]} |"
             )
         lines += [*([""] if runs else []), *_failures(result["failed"][variant])]
     return "\n".join(lines)
@@ -69,15 +83,18 @@ def means_table(result: dict[str, Any], suite: Suite):
     out.add_column("figure")
     for variant in result["means"]:
         out.add_column(variant, justify="right")
-    out.add_column("bar", justify="right")
+    for column in ("baseline", "bar"):
+        out.add_column(column, justify="right")
     out.add_column("")
+    baselines = baseline_means(result["runs"]["plain"])
     for figure in dict.fromkeys(f for m in result["means"].values() for f in m):
         bar, value = suite.bar(figure, result["quality"]), result["means"]["plain"].get(figure)
         row = [
             f"{m[figure]:.4g}" if figure in m else "" if m else "-"
             for m in result["means"].values()
         ]
-        out.add_row(figure, *row, bar_text(bar), "" if value is None else verdict(bar, value))
+        base = f"{baselines[figure]:.4g}" if figure in baselines else ""
+        out.add_row(figure, *row, base, bar_text(bar), "" if value is None else verdict(bar, value))
     return out
 
 

@@ -36,11 +36,6 @@ class Moments:
     at: np.ndarray
     tt: np.ndarray
 
-    def error(self, constant: np.ndarray) -> float:
-        """Mean squared error of the constant (C,)."""
-        squares = self.aa * constant**2 - 2 * self.at * constant + self.tt
-        return float(max(squares.mean(), 0.0))
-
 
 def moments_of(truth, where=None, coverage=None) -> Moments:
     """Of one view's truth (H, W) or (H, W, C). where: (H, W) bool, the pixels that count, default
@@ -57,20 +52,29 @@ def best_constant(views: list[Moments], psnr: bool) -> tuple[np.ndarray, float]:
     """(constant (C,), figure). The figure is the mean over views of the PSNR (peak 1, at most 100
     dB), or of the mean squared error.
 
-    The mean of logarithms has its optimum where each view is weighted with the inverse of its own
-    error: a fixed point, iterated from the least-squares solution.
+    The mean of logarithms has its optima where each view is weighted with the inverse of its own
+    error: a fixed point, iterated from the least-squares solution and from each view's own best
+    constant, since there may be several; the best is kept.
     """
-    weight = np.ones(len(views))
-    constant = np.zeros(len(views[0].tt))
-    for _ in range(ROUNDS if psnr else 1):
-        total = sum(w * v.aa for w, v in zip(weight, views, strict=True))
-        along = sum(w * v.at for w, v in zip(weight, views, strict=True))
-        constant = np.asarray(along / np.maximum(total, 1e-30))
-        weight = 1 / np.maximum([v.error(constant) for v in views], 1e-12)
-    errors = np.array([v.error(constant) for v in views])
-    if psnr:
-        return constant, float(np.minimum(100.0, -10 * np.log10(np.maximum(errors, 1e-12))).mean())
-    return constant, float(errors.mean())
+    aa, at, tt = (np.array([getattr(v, name) for v in views]) for name in ("aa", "at", "tt"))
+
+    def errors(constant: np.ndarray) -> np.ndarray:
+        squares = aa * constant**2 - 2 * at * constant + tt
+        return np.maximum(squares.mean(1), 0.0)
+
+    least = at.sum(0) / np.maximum(aa.sum(0), 1e-30)
+    if not psnr:
+        return least, float(errors(least).mean())
+    found = []
+    for start in (least, *(at / np.maximum(aa, 1e-30))):
+        constant = start
+        for _ in range(ROUNDS):
+            weight = 1 / np.maximum(errors(constant), 1e-12)[:, None]
+            constant = (weight * at).sum(0) / np.maximum((weight * aa).sum(0), 1e-30)
+        values = np.minimum(100.0, -10 * np.log10(np.maximum(errors(constant), 1e-12)))
+        found.append((float(values.mean()), constant))
+    value, constant = max(found, key=lambda f: f[0])
+    return constant, value
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from relit.evaluate.multiview import fixed_albedo_scale, material_figures, relit
 from relit.evaluate.picture_figures import Draw
 from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
-from relit.evaluate.truth import Truth, camera_key
+from relit.evaluate.truth import Truth, camera_key, ceiling_of
 from relit.geometry.se3 import align_cameras, nearest_rotation, umeyama
 from relit.scene import Asset, Camera
 
@@ -145,6 +145,7 @@ def evaluate_collection_asset(
             {**common.DEFINITIONS, **DEFINITIONS},
             baselines | constants.baselines(),
         ),
+        "ceiling": ceiling_of(truth.folder),
         "per_view": per_view,
         "albedo_scale": [float(x) for x in scale],
         "alignment": "sim3",

@@ -31,6 +31,7 @@ from relit.evaluate.pile_alignment import (
 )
 from relit.evaluate.pile_views import PileTruth, PileViews, load_pile_truth, registered_poses
 from relit.evaluate.results import entries, view_means
+from relit.evaluate.truth import ceiling_of
 from relit.files import parse_toml
 from relit.geometry.se3 import nearest_rotation
 from relit.scene import Asset, Camera, Pixels
@@ -156,6 +157,7 @@ def evaluate_duplicates(
     baselines |= constants.baselines()
     return {
         "metrics": entries(values, DUPLICATES_DEFINITIONS, baselines),
+        "ceiling": ceiling_of(truth.folder),
         "per_view": per_view,
         "albedo_scale": [float(x) for x in factor],
         "alignment": "scale about the camera",

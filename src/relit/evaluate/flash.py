@@ -25,6 +25,7 @@ from relit.evaluate.lpips import Lpips
 from relit.evaluate.picture_figures import Draw, definitions_of, picture_figures
 from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
+from relit.evaluate.truth import ceiling_of
 from relit.scene import Asset, Camera, Flash
 
 RATIO = "times the ratio of intensities, predicted over true (albedos and intensity share a factor)"
@@ -191,6 +192,7 @@ def evaluate_flash_asset(
         ]
     return {
         "metrics": entries(values, FLASH_DEFINITIONS, constants.baselines()),
+        "ceiling": ceiling_of(truth.folder),
         "per_view": per_view,
     }
 

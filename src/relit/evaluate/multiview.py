@@ -21,7 +21,7 @@ from relit.evaluate.lpips import Lpips
 from relit.evaluate.picture_figures import Draw, picture_figures, prefixed
 from relit.evaluate.results import entries, view_means
 from relit.evaluate.surfaces import chamfer_figures
-from relit.evaluate.truth import Truth, camera_key
+from relit.evaluate.truth import Truth, camera_key, ceiling_of
 from relit.scene import Asset, Camera
 
 
@@ -58,6 +58,7 @@ def evaluate_asset(
     values = {**view_means(per_view), **values}
     return {
         "metrics": entries(values, DEFINITIONS, baselines),
+        "ceiling": ceiling_of(truth.folder),
         "per_view": per_view,
         "albedo_scale": [float(x) for x in scale],
         "alignment": alignment,

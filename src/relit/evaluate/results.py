@@ -13,12 +13,18 @@ from relit.evaluate.baselines import Baselines
 
 @dataclass(frozen=True)
 class PaperValue:
-    """A published value of a figure. value: as printed. where: paper and table, with what differs.
-    rerun: the same figure in the authors' own later run, where known."""
+    """A published value of a figure. value: as printed. where: paper and table. rerun: the same
+    figure in the authors' own later run, where known. note: what differs, other values beside."""
 
     value: float
     where: str
     rerun: float | None = None
+    note: str = ""
+
+    @property
+    def source(self) -> str:
+        """where and note."""
+        return self.where + (f"; {self.note}" if self.note else "")
 
 
 def entries(
@@ -43,7 +49,7 @@ def entries(
             out[name] |= {"baseline": float(value), "baseline_definition": text}
         if papers and name in papers:
             paper = papers[name]
-            out[name] |= {"paper": paper.value, "paper_where": paper.where}
+            out[name] |= {"paper": paper.value, "paper_where": paper.source}
             if paper.rerun is not None:
                 out[name]["rerun"] = paper.rerun
     return out

@@ -44,6 +44,24 @@ def truth_kind(folder: str | Path) -> str:
     return kind if isinstance(kind, str) else ""
 
 
+def ceiling_of(folder: str | Path) -> dict[str, dict[str, float]]:
+    """light -> figures of the TRUE asset in Relit's own renderer against the truth's pictures
+    (`synthesize.ceiling`): no fit reaches more. {} where truth.json has none."""
+    try:
+        said = json.loads((Path(folder) / "truth" / "truth.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    ceiling = said.get("ceiling") if isinstance(said, dict) else None
+    if not isinstance(ceiling, dict):
+        return {}
+    numbers = {
+        light: {k: float(v) for k, v in figures.items() if isinstance(v, (int, float))}
+        for light, figures in ceiling.items()
+        if isinstance(figures, dict)
+    }
+    return {light: figures for light, figures in numbers.items() if figures}
+
+
 def has_truth(folder: str | Path) -> bool:
     """Whether `relit synthesize` made the folder, finished or not."""
     folder = Path(folder)

@@ -97,25 +97,27 @@ DEFINITIONS: dict[str, tuple[str, str]] = {
 }
 PAPERS = {
     "duplicates": {
-        "albedo_psnr": PaperValue(17.63, "SfD Tab. 1, one photo, mean of its objects", 17.28),
-        "roughness_mse": PaperValue(0.062, "SfD Tab. 1, one photo", 0.070),
-        "relit_psnr": PaperValue(21.37, "SfD Tab. 1, one photo"),
+        "albedo_psnr": PaperValue(17.63, "SfD Tab. 1", 17.28, "one photo"),
+        "roughness_mse": PaperValue(0.062, "SfD Tab. 1", 0.070, "one photo"),
+        "relit_psnr": PaperValue(21.37, "SfD Tab. 1", note="one photo"),
         "novel_psnr": PaperValue(
-            20.33, "SfD Tab. 3, real photos; the re-run is of 15 synthetic objects", 20.28
+            20.33, "SfD Tab. 3", 20.28, "real photos; the re-run is of 15 synthetic objects"
         ),
-        "environment_mse": PaperValue(0.052, "SfD Tab. 1, one photo", 0.137),
-        "chamfer": PaperValue(0.034, "SfD Tab. 1, one photo; its unit is not stated"),
+        "environment_mse": PaperValue(0.052, "SfD Tab. 1", 0.137, "one photo"),
+        "chamfer": PaperValue(0.034, "SfD Tab. 1", note="one photo; its unit is not stated"),
         "rotation_mean": PaperValue(
-            0.186, "SfD Tab. 2, 10 instances (2.5 at 6, .45 at 30, 51.5 at 60)"
+            0.186, "SfD Tab. 2, N = 10", note="2.5 at N = 6, .45 at 30, 51.5 at 60"
         ),
-        "translation_mean": PaperValue(0.003, "SfD Tab. 2, 10 instances (.070 at 6, .644 at 60)"),
+        "translation_mean": PaperValue(
+            0.003, "SfD Tab. 2, N = 10", note=".070 at N = 6, .644 at 60"
+        ),
     },
     "multiview": {
         "albedo_psnr": PaperValue(21.96, "SfD Tab. 1, 100 views"),
         "roughness_mse": PaperValue(0.026, "SfD Tab. 1, 100 views"),
         "relit_psnr": PaperValue(25.49, "SfD Tab. 1, 100 views"),
         "environment_mse": PaperValue(0.029, "SfD Tab. 1, 100 views"),
-        "chamfer": PaperValue(0.011, "SfD Tab. 1, 100 views; its unit is not stated"),
+        "chamfer": PaperValue(0.011, "SfD Tab. 1, 100 views", note="its unit is not stated"),
     },
 }
 
@@ -237,10 +239,10 @@ def pose_chance(true_poses: Mapping[int, np.ndarray], photo: Camera) -> Baseline
     return chance(drawn)
 
 
-def surface_score(mesh, true_mesh, true_from_mesh: np.ndarray) -> float:
+def surface_score(mesh, true_mesh, true_from_mesh: np.ndarray, count: int = SAMPLES) -> float:
     """Chamfer-L1 in radii of the true object. mesh, true_mesh: (vertices, faces)."""
-    own = m.sample_surface(*mesh, SAMPLES, seed=0).samples
-    true = m.sample_surface(*true_mesh, SAMPLES, seed=1).samples
+    own = m.sample_surface(*mesh, count, seed=0).samples
+    true = m.sample_surface(*true_mesh, count, seed=1).samples
     vertices = np.asarray(true_mesh[0], np.float64)
     middle = (vertices.min(0) + vertices.max(0)) / 2
     radius = float(np.linalg.norm(vertices - middle, axis=1).max())
