@@ -24,6 +24,7 @@ from relit.evaluate.collection import DEFINITIONS as COLLECTION
 from relit.evaluate.definitions import DEFINITIONS
 from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS as DUPLICATES
 from relit.evaluate.flash import FLASH_DEFINITIONS as FLASH
+from relit.evaluate.protocols import orb, pir, samurai, sfd
 from relit.files import parse_toml
 from relit.viewer.page import PAGE
 from support import camera_ring
@@ -209,10 +210,20 @@ def test_flags_page_lists_all_flags(verb, kind):
     assert listed_flags(verb, kind and f"{verb} {kind}") == known
 
 
-def test_figures_page_defines_all_figures():
-    defined = set(re.findall(r"^\* `([a-z_0-9]+)`", (ROOT / "docs/figures.md").read_text(), re.M))
+def test_definitions_page_defines_all_figures():
+    defined = set(
+        re.findall(r"^\* `([a-z_0-9]+)`", (ROOT / "docs/definitions.md").read_text(), re.M)
+    )
     assert (
-        defined == {name for some in (DEFINITIONS, FLASH, COLLECTION, DUPLICATES) for name in some}
+        defined
+        == {
+            name
+            for some in (
+                *(DEFINITIONS, FLASH, COLLECTION, DUPLICATES),
+                *(each.DEFINITIONS for each in (sfd, pir, samurai, orb)),
+            )
+            for name in some
+        }
         and len(defined) > 10
     )
 

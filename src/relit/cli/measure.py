@@ -21,7 +21,7 @@ def evaluate_flags(parser: Parser) -> None:
     protocol = "how to measure: relit, or as a paper's released code: sfd, pir, samurai, orb"
     parser.common.add_argument("--protocol", default="relit", metavar="NAME", help=protocol)
     device_flag(parser)
-    network = "also LPIPS, by this network (two pictures in, one number out); needs onnxruntime"
+    network = "also LPIPS, by this network of two inputs; needs onnxruntime"
     parser.more.add_argument("--lpips", type=Path, default=None, metavar="FILE.onnx", help=network)
     parser.more.add_argument(
         "--spp",
