@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from relit.evaluate.baselines import Constants, best_constant, moments_of, random_rotations
-from relit.evaluate.duplicates import instance_chance, instance_pose_figures
+from relit.evaluate.duplicates import instance_chance, instance_pose_figures, surface_chance
 from relit.geometry.se3 import exp_so3
+from relit.scene import Camera
 
 
 def test_the_best_constant_of_a_squared_error_is_the_mean():
@@ -102,4 +103,19 @@ def test_chance_of_instances():
     assert chance["rotation_pairs"][0] == pytest.approx(132.3, abs=3)
     assert 90 < chance["rotation_median"][0] < 133 and chance["registered"][0] < 10
     assert "fixed seed" in chance["registered"][1]
+    assert chance["rotation_before"] == chance["rotation_median"]
     assert instance_chance([], true, {}) == {}
+
+
+def test_chance_between_surfaces_is_nothing_for_a_ball_and_something_for_a_rod():
+    true = posed([0, 0, 0], [0, 50, 0], [70, 0, 0])
+    camera = Camera(8, 8, 9.0, 9.0, 4.0, 4.0, np.eye(4))
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    value = surface_chance([0, 1, 2], true, camera, ball, 1.0)["surface_median"][0]
+    assert value < 0.06
+    # two rods through one point at an angle x: points at r are r sin x off, .5 pi / 4 on average
+    rod = np.linspace([-1, 0, 0], [1, 0, 0], 400)
+    value = surface_chance([0, 1, 2], true, camera, rod, 1.0)["surface_median"][0]
+    assert value == pytest.approx(0.5 * np.pi / 4, abs=0.1)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from relit.conventions import move_points
+from relit.conventions import move_points, similarity
 from relit.errors import UserError
 from relit.evaluate import metrics as m
 from relit.evaluate.alignment import angles_between
@@ -41,6 +41,7 @@ VISIBLE = (
 )
 SAMPLES = 30_000
 PHOTO_SIDE = 480  # pixels of the re-rendered photo, longer side
+SURFACE_DRAWS = 5  # of chance between surfaces, whose median over instances varies little
 LOST = 180.0  # degrees: the rotation error of an instance that is not registered
 MASKED = f"pixels of the objects (truth coverage >= {m.MASK}) in novel views of the whole pile; a pixel without a prediction is black"
 FRAME = "novel views of the whole pile, whole frame, black where no object is"
@@ -177,9 +178,7 @@ def _pose_and_shape_figures(
     baselines = instance_chance(list(poses), truth.poses, visible)
     before = poses_before(run, photo, list(poses))
     if len(before) == len(poses):
-        earlier = instance_pose_figures(before, truth.poses, visible)
-        values["rotation_before"] = earlier["rotation_median"]
-        values["pairs_before"] = earlier["rotation_pairs"]
+        values |= _earlier(instance_pose_figures(before, truth.poses, visible))
     loaded = trimesh.load(truth.folder / "truth" / "mesh.ply", process=False)
     points = m.sample_surface(loaded.vertices, loaded.faces, SAMPLES).samples
     scale, own_middle, fitted = scene_alignment(
@@ -190,6 +189,7 @@ def _pose_and_shape_figures(
     )
     some = points[:: SAMPLES // 2000]
     values["surface_median"] = add_s(poses, truth.poses, photo, scale, fitted, some) / radius
+    baselines |= surface_chance(list(poses), truth.poses, photo, some, radius)
     own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES, seed=1).samples
     middle = (points.min(0) + points.max(0)) / 2
     by_poses = frame_by_poses(poses, truth.poses, scale, own_middle, middle)
@@ -270,11 +270,7 @@ def evaluate_on_photo(
         baselines = instance_chance(list(poses), reference, visible)
         before = poses_before(Path(run), asset.cameras[0][1], list(poses))
         if len(before) == len(poses):
-            earlier = instance_pose_figures(before, reference, visible)
-            values["rotation_before"], values["pairs_before"] = (
-                earlier["rotation_median"],
-                earlier["rotation_pairs"],
-            )
+            values |= _earlier(instance_pose_figures(before, reference, visible))
     return {"metrics": entries(values, DUPLICATES_DEFINITIONS, baselines), "per_view": {}}
 
 
@@ -401,7 +397,34 @@ def instance_chance(labels: list[int], true_poses: Mapping, visible: Mapping) ->
             poses[k][:3, :3] = turn
         return instance_pose_figures(poses, true_poses, visible)
 
-    return chance(drawn) if known else {}
+    found = chance(drawn) if known else {}
+    return found | (_earlier(found) if found else {})
+
+
+def _earlier(figures: Mapping[str, Any]) -> dict[str, Any]:
+    """The figures of the poses before the joint refinement, under their own names."""
+    return {
+        "rotation_before": figures["rotation_median"],
+        "pairs_before": figures["rotation_pairs"],
+    }
+
+
+def surface_chance(
+    labels: list[int], true_poses: Mapping, photo: Camera, points: np.ndarray, radius: float
+) -> Baselines:
+    """What the true surface at random rotations about its middle scores as surface_median."""
+    known = {k: true_poses[k] for k in labels if k in true_poses}
+    middle = (points.min(0) + points.max(0)) / 2
+
+    def drawn(rng: np.random.Generator) -> dict[str, float]:
+        turned = {}
+        turns = random_rotations(len(known), rng)
+        for (k, pose), turn in zip(known.items(), turns, strict=True):
+            turned[k] = pose @ similarity(turn, middle - turn @ middle)
+        value = add_s(turned, known, photo, 1.0, np.eye(4), points) / radius
+        return {"surface_median": value}
+
+    return chance(drawn, SURFACE_DRAWS) if known else {}
 
 
 def poses_before(run: Path, photo: Camera, labels: list[int]) -> dict[int, np.ndarray]:
