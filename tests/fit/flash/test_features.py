@@ -7,8 +7,8 @@ import pytest
 
 from relit.fit.flash.dino import DinoNetwork
 from relit.fit.flash.features import (
-    FlashScene,
-    FlashView,
+    FlashLamp,
+    FlashPhotos,
     capture_features,
     flash_views_of,
     network_features,
@@ -42,13 +42,13 @@ def places():
     return 0.7 * n, n, np.stack([u, v], -1)
 
 
-FLASH = FlashView(np.array(scene.OFFSET), scene.INTENSITY)
+FLASH = FlashLamp(np.array(scene.OFFSET), scene.INTENSITY)
 
 
 def test_albedo_from_photos_from_the_side(shot, places):
     bank, views, mesh, truth = shot
     x, n, uv = places
-    found = capture_features(FlashScene(bank, views, mesh, Coat(), FLASH), x, n)
+    found = capture_features(FlashPhotos(bank, views, mesh, Coat(), FLASH), x, n)
     true, _ = plastic_at(truth, mi.Point2f(uv[:, 0], uv[:, 1]))
     true = np.array(true.diffuse).T
     assert found.seen.mean() > 0.9
@@ -63,7 +63,7 @@ def test_places_behind_the_ball_are_not_seen(shot, places):
     bank, views, mesh, _ = shot
     x, n, _ = places
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))
-    seen = flash_views_of(FlashScene(bank, views, mesh, Coat(), FLASH), 3, point, normal)
+    seen = flash_views_of(FlashPhotos(bank, views, mesh, Coat(), FLASH), 3, point, normal)
     facing = (n * (views[3].centre - x)).sum(1) > 0
     assert not np.array(seen.ok)[~facing].any() and np.array(seen.ok)[facing].mean() > 0.7
     u, v, _ = views[3].project(x).T
@@ -75,7 +75,7 @@ def test_features_of_a_network_tell_the_paints_apart(shot, places, tmp_path):
     bank, views, mesh, truth = shot
     x, n, uv = places
     write_network(tmp_path / "patches.onnx", np.random.default_rng(3).normal(0, 0.02, (5, 3, 8, 8)))
-    shown = FlashScene(bank, views, mesh, Coat(), FLASH)
+    shown = FlashPhotos(bank, views, mesh, Coat(), FLASH)
     got = network_features(shown, x, n, DinoNetwork(tmp_path / "patches.onnx"))
     true, _ = plastic_at(truth, mi.Point2f(uv[:, 0], uv[:, 1]))
     bright = np.array(true.diffuse.x) > 0.4

@@ -69,7 +69,7 @@ def check(loss, start, name, step, parts=4):
         )
 
 
-class FlashScene:
+class FlashPhotos:
     """Rays onto a saddle, which trilinear interpolation holds exactly; `shadows`: with a ball
     between it and the flash."""
 
@@ -144,7 +144,7 @@ class FlashScene:
     "name, step", [("offset", 1e-3), ("distances", 1e-4), ("features", 2e-3), ("alpha", 1e-3)]
 )
 def test_shading(name, step):
-    scene = FlashScene(shadows=False)
+    scene = FlashPhotos(shadows=False)
     assert np.mean(np.array(scene.counts)) > 0.5
     check(scene.loss, scene.start, name, step, parts=3)
 
@@ -152,8 +152,8 @@ def test_shading(name, step):
 def test_the_offset_feels_shadows():
     """Shadow rays start at points that are held, so that of the whole term the offset alone has an
     exact difference."""
-    scene = FlashScene(shadows=True)
-    plain = FlashScene(shadows=True)
+    scene = FlashPhotos(shadows=True)
+    plain = FlashPhotos(shadows=True)
     plain.appearance.shadows_from = np.inf
     start = {k: mi.Float(v) for k, v in scene.start.items()}
     assert abs(float(scene.loss(start)[0]) / float(plain.loss(start)[0]) - 1) > 0.002

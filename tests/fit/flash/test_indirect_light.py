@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from relit.fit.flash.ambient import find_ambient
-from relit.fit.flash.features import FlashScene, FlashView, capture_features, flash_views_of
+from relit.fit.flash.features import FlashLamp, FlashPhotos, capture_features, flash_views_of
 from relit.fit.passes.pixels import batch_of, make_bank
 from relit.geometry.se3 import look_at
 from relit.lighting.flash import light_position
@@ -186,17 +186,17 @@ def photos(scene):
 
 @pytest.fixture(scope="module")
 def ambient(scene, photos):
-    return find_ambient(*photos, scene[0], Coat(), FlashView(np.array(OFFSET), 6.0), max(DIFFUSE))
+    return find_ambient(*photos, scene[0], Coat(), FlashLamp(np.array(OFFSET), 6.0), max(DIFFUSE))
 
 
 def test_first_colours_do_not_hold_the_bowl_s_own_light(scene, photos, ambient):
     traceable = scene[1]
     bank, views = photos
-    flash, coat = FlashView(np.array(OFFSET), 6.0), Coat()
+    flash, coat = FlashLamp(np.array(OFFSET), 6.0), Coat()
     rng = np.random.default_rng(1)
     n = rng.normal(size=(600, 3)) * [1, 0, 1] + [0, 1.5, 0]
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    shown = FlashScene(bank, views, traceable, coat, flash)
+    shown = FlashPhotos(bank, views, traceable, coat, flash)
     without = capture_features(shown, -0.8 * n, n)
     found = capture_features(shown, -0.8 * n, n, ambient)
     assert found.seen.mean() > 0.95
@@ -232,7 +232,7 @@ def test_a_ball_does_not_light_itself(device):
     )
     assert (
         find_ambient(
-            bank, [camera] * 3, mesh, Coat(), FlashView(np.array(OFFSET), 6.0), 0.8
+            bank, [camera] * 3, mesh, Coat(), FlashLamp(np.array(OFFSET), 6.0), 0.8
         ).light.max()
         < 1e-4
     )
@@ -255,7 +255,7 @@ def test_a_flash_that_throws_no_shadow_throws_none_anywhere(scene):
         dark, bright = (
             np.array(
                 flash_views_of(
-                    FlashScene(bank, [camera], traceable, Coat(), FlashView(offset, 1.0, shadow)),
+                    FlashPhotos(bank, [camera], traceable, Coat(), FlashLamp(offset, 1.0, shadow)),
                     0,
                     x,
                     n,

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from relit.fit.flash.features import ALPHA, FlashScene, FlashView, capture_features, flash_views_of
+from relit.fit.flash.features import ALPHA, FlashLamp, FlashPhotos, capture_features, flash_views_of
 from relit.fit.passes.pixels import PixelBank
 from relit.geometry.bake import fill_gutters
 from relit.geometry.sdf import node_positions
@@ -92,7 +92,7 @@ def find_ambient(
     cameras: list[Camera],
     mesh: Mesh,
     coat: Coat,
-    flash: FlashView,
+    flash: FlashLamp,
     brightest: float,
 ) -> Ambient:
     """mesh: unit frame. brightest: the 99th percentile of the diffuse albedo that is assumed: how
@@ -105,7 +105,7 @@ def find_ambient(
         coat.mean_transmittance(ALPHA),
         1 / ((1 - float(coat.internal(mi.Float(ALPHA))[0])) * coat.ior**2),
     )
-    scene = FlashScene(bank, cameras, traceable, coat, flash)
+    scene = FlashPhotos(bank, cameras, traceable, coat, flash)
     straight = np.zeros((bank.views, len(x)))
     entering = np.zeros_like(straight)
     point, normal = (mi.Vector3f(np.ascontiguousarray(a.T, np.float32)) for a in (x, n))

@@ -40,7 +40,7 @@ ALPHA = 0.2  # of the coat that the diffuse light passes
 
 
 @dataclass(frozen=True)
-class FlashView:
+class FlashLamp:
     """offset: (3,) unit frame, OpenCV camera axes. intensity: radiant. shadow: whether it throws
     any."""
 
@@ -50,7 +50,7 @@ class FlashView:
 
 
 @dataclass(frozen=True)
-class FlashScene:
+class FlashPhotos:
     """Photos under the flash, and the surface that they show. cameras: unit frame. mesh: in the unit
     frame."""
 
@@ -58,7 +58,7 @@ class FlashScene:
     cameras: list[Camera]
     mesh: TraceableMesh
     coat: Coat
-    flash: FlashView
+    flash: FlashLamp
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class TexelEvidence:
 
 
 def capture_features(
-    scene: FlashScene, x: np.ndarray, n: np.ndarray, ambient: Any = None
+    scene: FlashPhotos, x: np.ndarray, n: np.ndarray, ambient: Any = None
 ) -> TexelEvidence:
     """The features of N surface points x with normals n, both (N, 3), unit frame. ambient:
     fit.flash_ambient.Ambient, light from the surface itself, none where None."""
@@ -119,7 +119,7 @@ class Seen:
     inverse: Any
 
 
-def flash_views_of(scene: FlashScene, view: int, x, n, lit_only: bool = False) -> Seen:
+def flash_views_of(scene: FlashPhotos, view: int, x, n, lit_only: bool = False) -> Seen:
     """x, n: Vector3f, unit frame. lit_only: `ok` tells of the flash alone, not of the camera."""
     bank, camera, flash = scene.bank, scene.cameras[view], scene.flash
     number = dr.opaque(mi.UInt32, view)
@@ -154,7 +154,7 @@ def flash_views_of(scene: FlashScene, view: int, x, n, lit_only: bool = False) -
     return Seen(ok, column, row, cos_v, cos_l, inverse)
 
 
-def shading_free(scene: FlashScene, view: int, x, n, around=0.0):
+def shading_free(scene: FlashPhotos, view: int, x, n, around=0.0):
     """The photo's value at the points over what a white diffuse base would show there, (N, 3), NaN
     where the photo does not show them; and the cosine of the viewer's direction (N,). around: (N,
     3) irradiance from the surface itself over the flash's intensity, or 0."""
@@ -188,7 +188,7 @@ def shading_free(scene: FlashScene, view: int, x, n, around=0.0):
 
 
 def network_features(
-    scene: FlashScene, x: np.ndarray, n: np.ndarray, network: DinoNetwork
+    scene: FlashPhotos, x: np.ndarray, n: np.ndarray, network: DinoNetwork
 ) -> np.ndarray:
     """(N, 4) float32: the network's features on the points, for `Found.features`; 0 where no photo
     shows them."""

@@ -29,7 +29,7 @@ from relit.capture.photo import layers
 from relit.errors import UserError
 from relit.fit.flash.ambient import find_ambient
 from relit.fit.flash.dino import DinoNetwork, network_file
-from relit.fit.flash.features import FlashScene, FlashView, capture_features, network_features
+from relit.fit.flash.features import FlashLamp, FlashPhotos, capture_features, network_features
 from relit.fit.flash.lobe_clusters import start_kinship
 from relit.fit.flash.surface import FlashModel, FlashSurfaceOptions, FlashTerms, fit_flash_surface
 from relit.fit.passes.held_out import score_held_out
@@ -320,7 +320,7 @@ def look_around(photos: UnitPhotos, model: VolumeModel, coat: Coat, shadow: bool
     """Give the model's appearance the light that its surface, as it is now, throws on itself.
     shadow: whether the flash casts any."""
     values = dense_values(model.grid)
-    flash = FlashView(np.array(model.reflections)[:3], float(model.appearance.intensity[0]), shadow)
+    flash = FlashLamp(np.array(model.reflections)[:3], float(model.appearance.intensity[0]), shadow)
     mesh = extract_mesh(values, faces=COARSE_FACES)
     ambient = find_ambient(photos.bank, photos.cameras, mesh, coat, flash, BRIGHTEST)
     model.appearance.around = ambient.around(values, coat)
@@ -399,13 +399,13 @@ def flash_terms(
     options, o = fit.options, surface_options(fit.options)
     bank, cameras, mesh, coat = photos.bank, photos.cameras, shaped.mesh, Coat(options.ior)
     traceable = TraceableMesh(mesh, np.zeros_like(mesh.vertices))
-    flash = FlashView(shaped.offset, shaped.intensity, o.shadow)
+    flash = FlashLamp(shaped.offset, shaped.intensity, o.shadow)
     known = texels.known
     x, n = texels.on_faces(mesh.vertices)[known], texels.on_faces(mesh.normals)[known]
     ambient = None
     if o.directions > 0:
         ambient = find_ambient(bank, cameras, mesh, coat, flash, BRIGHTEST)
-    scene = FlashScene(bank, cameras, traceable, coat, flash)
+    scene = FlashPhotos(bank, cameras, traceable, coat, flash)
     found = capture_features(scene, x, n, ambient)
     diffuse = texels.spread(shaped.albedo[:, :3])
     diffuse[known] = np.where(found.seen[:, None], found.albedo, diffuse[known])

@@ -138,7 +138,7 @@ def place(
             views, crops, revolved.placed, o, seed=seed, links=links, say=say
         )
         if matched is not None:
-            return verified(views, crops, matched, o, True, seed=seed, say=say)[0]
+            return rounds_verified(views, crops, matched, o, True, seed=seed, say=say)[0]
     if revolved is not None and revolved.certain and mostly_sure(revolved.placed):
         return by_axes(revolved.placed, say)
     if revolved is not None:
@@ -171,7 +171,7 @@ def place(
     if not believed(best, o):
         doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
         say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
-    found, rings = verified(views, crops, best, o, believed(best, o), seed=seed, say=say)
+    found, rings = rounds_verified(views, crops, best, o, believed(best, o), seed=seed, say=say)
     if len(views) > 3:
         detailed = crop_rings(crops, DETAILED)
         turned = coherent_turns(views, crops, detailed, found.poses, o, seed=seed + 70, say=say)
@@ -191,7 +191,7 @@ def place(
     return found
 
 
-def verified(
+def rounds_verified(
     views: list[InstanceView],
     crops,
     best: Placed,
