@@ -108,7 +108,7 @@ def aligned_psnr(shown, truth, mask) -> float:
     return m.psnr(np.clip(shown, 0, 1), np.clip(scaled, 0, 1))
 
 
-def pir_view_scores(
+def view_scores(
     view: FlashView, constants: Constants, lpips: Lpips | None = None
 ) -> dict[str, float]:
     """All figures of one view; its truth is added to `constants`."""
@@ -143,7 +143,7 @@ def constant_aligned(view: FlashView) -> dict[str, float]:
     return out
 
 
-def pir_surface_score(asset: Asset, truth: FlashTruth) -> float:
+def surface_score(asset: Asset, truth: FlashTruth) -> float:
     """Half the sum of the two mean point-to-mesh distances, in radii."""
     import trimesh
 
@@ -162,11 +162,11 @@ def evaluate_by_protocol(run: Path, folder: Path, draw: Draw) -> dict[str, Any]:
     asset, constants = in_true_frame(load_asset(run), truth), Constants()
     per_view, flat = {}, {}
     for view in flash_views(asset, truth, draw):
-        per_view[view.name] = pir_view_scores(view, constants, draw.lpips)
+        per_view[view.name] = view_scores(view, constants, draw.lpips)
         flat[view.name] = constant_aligned(view)
     values = view_means(per_view)
     if (folder / "truth" / "mesh.ply").is_file():
-        values["chamfer"] = pir_surface_score(asset, truth)
+        values["chamfer"] = surface_score(asset, truth)
     baselines = constants.baselines()
     baselines |= {name: (value, CONSTANT) for name, value in view_means(flat).items()}
     light = "offset" if np.linalg.norm(truth.flash.offset) > 0 else "co-located"

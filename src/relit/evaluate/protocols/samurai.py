@@ -17,7 +17,7 @@ import numpy as np
 from relit.conventions import move_points
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.alignment import align_centres, angles_between, turned_cameras
+from relit.evaluate.alignment import align_centres, angles_between, turned_about
 from relit.evaluate.baselines import Baselines, chance, random_rotations
 from relit.evaluate.collection import (
     cameras_and_lights,
@@ -72,7 +72,7 @@ def on_white_encoded(rgba) -> np.ndarray:
     return own * alpha + 1 - alpha
 
 
-def samurai_picture_scores(shown, truth, lpips: Lpips | None = None) -> dict[str, float]:
+def picture_scores(shown, truth, lpips: Lpips | None = None) -> dict[str, float]:
     """Of premultiplied linear pictures (H, W, 4)."""
     a, b, edge = on_white_encoded(shown), on_white_encoded(truth), m.SSIM_RADIUS
     out = {
@@ -103,7 +103,7 @@ def camera_chance_of(
     known = {n: c for n, c in train.items() if n in found}
 
     def drawn(rng: np.random.Generator) -> dict[str, float]:
-        turned = turned_cameras(centre, known, random_rotations(len(known), rng))
+        turned = turned_about(centre, known, random_rotations(len(known), rng))
         scores = camera_scores(turned, known)
         return {k: scores[k] for k in ("rotation_mean", "translation_mean")}
 
@@ -138,7 +138,7 @@ def evaluate_by_protocol(run: Path, folder: Path, draw: Draw) -> dict[str, Any]:
     for i, (name, reference) in enumerate(held.items()):
         one = replace(draw, seed=draw.seed + i)
         shown = shown_under(asset, *found[name], reference.shape[:2], one)
-        per_view[name] = samurai_picture_scores(shown, reference, draw.lpips)
+        per_view[name] = picture_scores(shown, reference, draw.lpips)
     values |= view_means(per_view)
     return {"metrics": entries(values, DEFINITIONS, baselines, PAPERS), "per_view": per_view}
 
