@@ -15,6 +15,8 @@ from relit.evaluate.picture_figures import Draw
 from relit.evaluate.pile_alignment import grown_about
 from relit.scene import Asset, Camera, Ground, Material
 
+COVERED = 0.5  # of a pixel; the truth's coverage is that of the pixel's centre, 0 or 1
+
 
 @dataclass(frozen=True)
 class PileTruth:
@@ -89,7 +91,7 @@ class PileViews:
         self, material: Material, light: np.ndarray, folder: str, draw: Draw
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """view -> (recovered, true) linear pictures (H, W, 3) under a light, black where no object
-        is: each by its own coverage. folder: of the truth's pictures."""
+        is: each by its own coverage, cut at COVERED. folder: of the truth's pictures."""
         from relit.reference.mitsuba_scene import build_scene, render
         from relit.reference.pile import build_pile
 
@@ -98,7 +100,7 @@ class PileViews:
         depth, out = self.truth.content["settings"]["max_depth"], {}
         for i, (name, camera) in enumerate(self.truth.cameras):
             shown = render(scene, camera, spp=draw.spp, seed=draw.seed + i, max_depth=depth)
-            covered = (self.predicted[name]["alpha"] > 0)[..., None]
+            covered = (self.predicted[name]["alpha"] >= COVERED)[..., None]
             true = self.truth.picture(f"{folder}/{name}")[..., :3]
             out[name] = shown[..., :3] * covered, true * (self.albedo[name][..., 3:] > 0)
         return out

@@ -91,7 +91,15 @@ def figures_table(result: dict[str, Any], title: str = "", definitions: bool = T
         if "paper_where" in entry:
             text += f". Paper: {entry['paper_where']}"
         out.add_row(*row, *([text] if definitions else []))
+    notes = []
     if "baseline" in extra:
         texts = dict.fromkeys(e["baseline_definition"] for e in metrics.values() if "baseline" in e)
-        out.caption = "Baseline: " + "; or ".join(texts) + "."
+        notes.append("Baseline: " + "; or ".join(texts) + ".")
+    if ceiling := result.get("ceiling"):
+        shown = (
+            f"{light} " + ", ".join(f"{name} {value:.1f}" for name, value in figures.items())
+            for light, figures in ceiling.items()
+        )
+        notes.append("Ceiling, the TRUE asset in Relit's renderer, dB: " + "; ".join(shown) + ".")
+    out.caption = "\n".join(notes) or None
     return out
