@@ -12,6 +12,8 @@ from relit.errors import UserError
 from relit.geometry import se3
 from relit.scene import Asset, Camera, Flash
 
+LOST = 180.0  # degrees: the rotation error of what has no pose, an instance or a photo
+
 
 def align_points(source, target, with_scale: bool = True) -> np.ndarray:
     """Least-squares similarity (4, 4) target_from_source of matched points (N, 3); Umeyama 1991,

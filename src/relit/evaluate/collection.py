@@ -17,7 +17,7 @@ from relit.conventions import move_points, similarity
 from relit.errors import UserError
 from relit.evaluate import definitions as common
 from relit.evaluate import metrics as m
-from relit.evaluate.alignment import align_centres, angles_between, turned_about
+from relit.evaluate.alignment import LOST, align_centres, angles_between, turned_about
 from relit.evaluate.baselines import Baselines, Constants, chance, random_rotations
 from relit.evaluate.lpips import Lpips
 from relit.evaluate.multiview import fixed_albedo_scale, material_figures, relit_figures
@@ -29,7 +29,6 @@ from relit.geometry.se3 import align_cameras, nearest_rotation, umeyama
 from relit.scene import Asset, Camera
 
 WITHIN = 10.0  # degrees
-LOST = 180.0  # degrees: the rotation error of a training photo without a camera
 _POSE = (
     "after the best similarity between the CENTRES of recovered and true training cameras "
     "(Procrustes, without those more than 3 medians off), which sees no orientation"

@@ -18,7 +18,7 @@ import numpy as np
 from relit.conventions import move_points, similarity
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.alignment import angles_between
+from relit.evaluate.alignment import LOST, angles_between
 from relit.evaluate.baselines import Baselines, Constants, chance, random_rotations
 from relit.evaluate.environments import ENVIRONMENT_DEFINITIONS, environment_figures
 from relit.evaluate.lpips import Lpips
@@ -42,7 +42,6 @@ VISIBLE = (
 SAMPLES = 30_000
 PHOTO_SIDE = 480  # pixels of the re-rendered photo, longer side
 SURFACE_DRAWS = 5  # of chance between surfaces, whose median over instances varies little
-LOST = 180.0  # degrees: the rotation error of an instance that is not registered
 MASKED = f"pixels of the objects (truth coverage >= {m.MASK}) in novel views of the whole pile; a pixel without a prediction is black"
 FRAME = "novel views of the whole pile, whole frame, black where no object is"
 RELIT = "the pile under unseen lights, base colour times the factors of albedo_psnr"

@@ -37,10 +37,10 @@ def test_sfd_pictures_are_compared_at_2_2_inside_the_mask():
     inside, network = disc(), disc(0.25)
     shown, truth = flat(0.0, 0.0, 0.0), flat(0.5**2.2, 0.5**2.2, 0.5**2.2)
     shown[network] = 0.5**2.2  # right where the network sees the object, black elsewhere
-    scores = sfd.picture_scores(shown, truth, inside, network)
+    scores = sfd.sfd_picture_scores(shown, truth, inside, network)
     assert scores["psnr"] == pytest.approx(-10 * np.log10(0.25 / 2), abs=1e-4)
     assert scores["psnr_both"] == pytest.approx(80)  # 1e-8 is added to the error
-    same = sfd.picture_scores(truth, truth, inside, inside)
+    same = sfd.sfd_picture_scores(truth, truth, inside, inside)
     assert same["ssim"] == pytest.approx(1)
 
 
@@ -52,7 +52,7 @@ def test_sfd_ssim_is_white_outside_and_takes_the_span_of_values():
     x, y = (np.where(inside[..., None], v ** (1 / 2.2), 1.0) for v in (a, b))
     span = max(x.max(), y.max()) - min(x.min(), y.min())
     theirs = structural_similarity(x, y, data_range=span, channel_axis=2)
-    assert sfd.picture_scores(a, b, inside, inside)["ssim"] == pytest.approx(theirs, abs=1e-9)
+    assert sfd.sfd_picture_scores(a, b, inside, inside)["ssim"] == pytest.approx(theirs, abs=1e-9)
 
 
 def test_sfd_factor_of_base_colour_is_taken_in_gamma_space():
@@ -64,13 +64,13 @@ def test_sfd_factor_of_base_colour_is_taken_in_gamma_space():
     a, b = shown ** (1 / 2.2), truth ** (1 / 2.2)
     factor = b[..., 0].sum() / a[..., 0].sum()
     expected = -10 * np.log10(np.mean((np.clip(a * factor, 0, 1) - b) ** 2) + 1e-8)
-    scores = sfd.albedo_scores(shown, truth, inside, inside)
+    scores = sfd.sfd_albedo_scores(shown, truth, inside, inside)
     assert scores["albedo_psnr"] == pytest.approx(expected)
     linear = truth[..., 0].sum() / shown[..., 0].sum()
     other = -10 * np.log10(np.mean((m.gamma_encode(shown * linear) - b) ** 2))
     assert abs(other - expected) > 0.3  # a factor of linear values gives another figure
     # any map of one value scores the same, as its factor makes it the mean
-    one = sfd.albedo_scores(flat(0.1, 0.1, 0.1), truth, inside, inside)["albedo_psnr"]
+    one = sfd.sfd_albedo_scores(flat(0.1, 0.1, 0.1), truth, inside, inside)["albedo_psnr"]
     assert one == pytest.approx(-10 * np.log10(b[..., 0].var() + 1e-8))
 
 
@@ -90,7 +90,7 @@ def test_sfd_view_collects_baselines():
         (rough, rough),
         {"relit:eve": (flat(0.1, 0.1, 0.1), flat(0.1, 0.1, 0.1))},
     )
-    scores = sfd.view_scores(view, constants, None)
+    scores = sfd.sfd_view_scores(view, constants, None)
     assert scores["relit_psnr:eve"] == pytest.approx(80) and scores["roughness_mse"] == 0
     assert constants.baselines()["roughness_mse"][0] == pytest.approx(0, abs=1e-12)
     assert {k.split(":")[0] for k in scores} <= set(sfd.DEFINITIONS)
@@ -143,7 +143,7 @@ def test_sfd_chamfer_is_in_radii():
 
     ball = trimesh.creation.icosphere(3, radius=2.0)
     mesh = (np.asarray(ball.vertices), np.asarray(ball.faces))
-    value = sfd.surface_score(mesh, mesh, similarity(np.eye(3), np.zeros(3), 1.1), 20_000)
+    value = sfd.sfd_surface_score(mesh, mesh, similarity(np.eye(3), np.zeros(3), 1.1), 20_000)
     assert value == pytest.approx(0.1, rel=0.02)  # a tenth of the radius apart
 
 
@@ -169,7 +169,7 @@ def flash_view(**changes) -> FlashView:
 def test_pir_pictures_have_8_bits_at_2_2_over_the_whole_frame():
     shown = flat(0, 0, 0)
     shown[disc(0.25)] = (51.2 / 255) ** 2.2  # rounds to 51: one fifth
-    scores = pir.view_scores(flash_view(picture=shown), Constants())
+    scores = pir.pir_view_scores(flash_view(picture=shown), Constants())
     assert scores["novel_psnr"] == pytest.approx(-10 * np.log10(0.2**2 / 4))
 
 
@@ -179,7 +179,7 @@ def test_pir_albedo_is_black_where_the_recovered_object_is_not():
     shown = flat(0, 0, 0)
     shown[disc(0.5)] = [0.6, 0.5, 1.5]
     constants = Constants()
-    scores = pir.view_scores(flash_view(diffuse=(shown, true)), constants)
+    scores = pir.pir_view_scores(flash_view(diffuse=(shown, true)), constants)
     error = (0.1**2 + 0 + 0.5**2) / 3 / 2  # 1.5 is clipped to 1; half of the frame
     assert scores["diffuse_psnr"] == pytest.approx(-10 * np.log10(error))
     assert constants.baselines()["diffuse_psnr"][0] == 100  # the truth is one value there
@@ -190,9 +190,9 @@ def test_pir_albedo_is_black_where_the_recovered_object_is_not():
 def test_pir_rims_hold_the_value_of_the_surface():
     coverage = np.where(disc(0.5), 0.6, 0.0)
     view = flash_view(coverage=coverage, alpha=(0.3 * coverage, 0.3 * disc(0.5)))
-    assert pir.view_scores(view, Constants())["roughness_mse"] == pytest.approx(0, abs=1e-12)
+    assert pir.pir_view_scores(view, Constants())["roughness_mse"] == pytest.approx(0, abs=1e-12)
     view = flash_view(coverage=coverage * 0.5, alpha=(0.15 * coverage, 0.3 * disc(0.5)))
-    assert pir.view_scores(view, Constants())["roughness_mse"] == pytest.approx(0.09 / 2)
+    assert pir.pir_view_scores(view, Constants())["roughness_mse"] == pytest.approx(0.09 / 2)
 
 
 def test_pir_constant_of_aligned_maps_is_scored():
@@ -216,8 +216,8 @@ def test_samurai_composes_srgb_values_on_white():
 def test_samurai_scores_a_picture():
     shown = np.concatenate([flat(0, 0, 0), flat(1)], -1)
     truth = np.concatenate([flat(0, 0, 0), flat(0)], -1)
-    assert samurai.picture_scores(shown, truth)["novel_psnr"] == pytest.approx(0)
-    assert samurai.picture_scores(shown, shown)["novel_ssim"] == pytest.approx(1)
+    assert samurai.samurai_picture_scores(shown, truth)["novel_psnr"] == pytest.approx(0)
+    assert samurai.samurai_picture_scores(shown, shown)["novel_ssim"] == pytest.approx(1)
 
 
 def test_samurai_cameras_are_aligned_by_all_centres():
@@ -250,7 +250,7 @@ def test_orb_masks_shrink_by_two_pixels():
 def test_orb_scale_undoes_a_factor_per_channel():
     rng = np.random.default_rng(3)
     truth = rng.uniform(0.1, 0.9, (SIZE, SIZE, 3))
-    scores = orb.picture_scores(truth * [0.5, 2, 3], truth, np.ones((SIZE, SIZE)))
+    scores = orb.orb_picture_scores(truth * [0.5, 2, 3], truth, np.ones((SIZE, SIZE)))
     assert scores["psnr_hdr"] == 100 and scores["psnr_ldr"] == 100
     assert scores["ssim"] == pytest.approx(1)
     np.testing.assert_allclose(orb.least_squares_scale([[0, 1, 2]], [[3, 3, 3]]), [3, 3, 1.5])

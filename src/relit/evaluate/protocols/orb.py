@@ -121,7 +121,7 @@ def compared(
     return max(m.psnr(a, b), m.psnr(0.5 * np.broadcast_to(only, b.shape), b)), a, b
 
 
-def picture_scores(shown, truth, mask, lpips: Lpips | None = None) -> dict[str, float]:
+def orb_picture_scores(shown, truth, mask, lpips: Lpips | None = None) -> dict[str, float]:
     """Of linear pictures (H, W, 3). mask: (H, W) true coverage."""
     inside = eroded(mask)
     hdr, _, _ = compared(
@@ -132,7 +132,7 @@ def picture_scores(shown, truth, mask, lpips: Lpips | None = None) -> dict[str, 
     return out if lpips is None else out | {"lpips": lpips(m.encode(a), m.encode(b))}
 
 
-def albedo_scores(shown, truth, mask) -> dict[str, float]:
+def orb_albedo_scores(shown, truth, mask) -> dict[str, float]:
     """Of linear base colours (H, W, 3)."""
     value, a, b = compared(shown, truth, eroded(mask), tone_mapped=False)
     return {"albedo_psnr": value, "albedo_ssim": float(m.ssim_map(a, b, RADIUS).mean())}
@@ -148,7 +148,7 @@ def normal_cosine(shown, truth, mask) -> float:
     return float((1 - (a * b).sum(-1))[inside].mean()) if inside.any() else float("nan")
 
 
-def surface_score(asset: Asset, vertices: np.ndarray) -> float:
+def orb_surface_score(asset: Asset, vertices: np.ndarray) -> float:
     """Mean of the two mean squared distances, world units squared. vertices: (N, 3), true."""
     own = m.sample_surface(asset.mesh.vertices, asset.mesh.faces, SAMPLES).samples
     return m.point_chamfer(move_points(asset.world_from_asset, own), vertices, squared=True)[0]
@@ -168,7 +168,7 @@ def evaluate_by_protocol(run: Path, folder: Path, draw: Draw) -> dict[str, Any]:
     asset, alignment = aligned(asset, truth.train, {camera_key(n): c for n, c in asset.cameras})
     per_view, flat = _views(asset, truth, draw)
     values = view_means(per_view)
-    values["chamfer"] = surface_score(asset, true_surface(folder)[0])
+    values["chamfer"] = orb_surface_score(asset, true_surface(folder)[0])
     baselines = {name: (value, CONSTANT) for name, value in view_means(flat).items()}
     return {
         "metrics": entries(values, DEFINITIONS, baselines, PAPERS),
@@ -194,15 +194,15 @@ def _views(asset: Asset, truth: Truth, draw: Draw):
     for i, (name, camera) in enumerate(truth.test.items()):
         p, albedo = render_channels(bare, camera, spp=32), truth.picture(f"test/{name}_albedo")
         true, mask = albedo[..., :3], albedo[..., 3]
-        figures = albedo_scores(p["albedo"], true, mask)
-        flat[name] = albedo_scores(np.ones_like(true), true, mask)
+        figures = orb_albedo_scores(p["albedo"], true, mask)
+        flat[name] = orb_albedo_scores(np.ones_like(true), true, mask)
         normal = truth.picture(f"test/{name}_normal")[..., :3]
         figures["normal_cosine"] = normal_cosine(p["normal"], normal, mask)
         for key, (scene, folder) in scenes.items():
             prefix, _, light = key.partition(":")
             shown = render(scene, camera, spp=draw.spp, seed=draw.seed + i)[..., :3]
             reference = truth.picture(f"{folder}/{name}")[..., :3]
-            scores = picture_scores(shown, reference, mask, draw.lpips)
+            scores = orb_picture_scores(shown, reference, mask, draw.lpips)
             figures |= prefixed(prefix, scores, f":{light}" if light else "")
         per_view[name] = figures
     return per_view, flat

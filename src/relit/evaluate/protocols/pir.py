@@ -32,14 +32,14 @@ from relit.scene import Asset
 KINDS = ("flash",)
 MEASURES = "flash captures with true albedos and roughness of their test views"
 WINDOW = 11  # pixels
-COVERED = 0.5  # of a pixel, above which the recovered mask holds it
+HALF_COVERED = 0.5  # of a pixel, above which the recovered mask holds it
 EPS = 1e-4  # least true value that a ratio is taken with
 SAMPLES = 100_000  # points a surface
 
 _FRAME = "mean over the whole frame; mean over views"
 _RATIO = (
     "linear, times the ratio of intensities (recovered over true), clipped to [0, 1], black in both "
-    f"where the recovered coverage is <= {COVERED}"
+    f"where the recovered coverage is <= {HALF_COVERED}"
 )
 _ALIGNED = (
     "instead of the ratio of intensities the TRUTH is scaled per channel and view by the median "
@@ -108,7 +108,7 @@ def aligned_psnr(shown, truth, mask) -> float:
     return m.psnr(np.clip(shown, 0, 1), np.clip(scaled, 0, 1))
 
 
-def view_scores(
+def pir_view_scores(
     view: FlashView, constants: Constants, lpips: Lpips | None = None
 ) -> dict[str, float]:
     """All figures of one view; its truth is added to `constants`."""
@@ -116,7 +116,7 @@ def view_scores(
     out = {"novel_psnr": m.psnr(a, b), "novel_ssim": m.ssim_uniform(a, b, WINDOW)}
     if lpips is not None:
         out["novel_lpips"] = lpips(a, b)
-    mask = view.coverage > COVERED
+    mask = view.coverage > HALF_COVERED
     full = np.maximum(view.coverage, 1e-9)  # one ray a pixel sees the object or does not
     for key, (shown, true) in (("diffuse", view.diffuse), ("specular", view.specular)):
         whole = shown / (full if shown.ndim == 2 else full[..., None])
@@ -134,7 +134,7 @@ def view_scores(
 def constant_aligned(view: FlashView) -> dict[str, float]:
     """The `_aligned` figures of maps of one value: the protocol scales the truth to that value, so
     it is set where the truth lies, to its median."""
-    mask, out = view.coverage > COVERED, {}
+    mask, out = view.coverage > HALF_COVERED, {}
     for key, true in (("diffuse", view.diffuse[1]), ("specular", view.specular[1])):
         _, ours = masked_pair(true, true, mask)
         if mask.any():
@@ -143,7 +143,7 @@ def constant_aligned(view: FlashView) -> dict[str, float]:
     return out
 
 
-def surface_score(asset: Asset, truth: FlashTruth) -> float:
+def pir_surface_score(asset: Asset, truth: FlashTruth) -> float:
     """Half the sum of the two mean point-to-mesh distances, in radii."""
     import trimesh
 
@@ -162,11 +162,11 @@ def evaluate_by_protocol(run: Path, folder: Path, draw: Draw) -> dict[str, Any]:
     asset, constants = in_true_frame(load_asset(run), truth), Constants()
     per_view, flat = {}, {}
     for view in flash_views(asset, truth, draw):
-        per_view[view.name] = view_scores(view, constants, draw.lpips)
+        per_view[view.name] = pir_view_scores(view, constants, draw.lpips)
         flat[view.name] = constant_aligned(view)
     values = view_means(per_view)
     if (folder / "truth" / "mesh.ply").is_file():
-        values["chamfer"] = surface_score(asset, truth)
+        values["chamfer"] = pir_surface_score(asset, truth)
     baselines = constants.baselines()
     baselines |= {name: (value, CONSTANT) for name, value in view_means(flat).items()}
     light = "offset" if np.linalg.norm(truth.flash.offset) > 0 else "co-located"

@@ -72,7 +72,7 @@ def on_white_encoded(rgba) -> np.ndarray:
     return own * alpha + 1 - alpha
 
 
-def picture_scores(shown, truth, lpips: Lpips | None = None) -> dict[str, float]:
+def samurai_picture_scores(shown, truth, lpips: Lpips | None = None) -> dict[str, float]:
     """Of premultiplied linear pictures (H, W, 4)."""
     a, b, edge = on_white_encoded(shown), on_white_encoded(truth), m.SSIM_RADIUS
     out = {
@@ -138,7 +138,7 @@ def evaluate_by_protocol(run: Path, folder: Path, draw: Draw) -> dict[str, Any]:
     for i, (name, reference) in enumerate(held.items()):
         one = replace(draw, seed=draw.seed + i)
         shown = shown_under(asset, *found[name], reference.shape[:2], one)
-        per_view[name] = picture_scores(shown, reference, draw.lpips)
+        per_view[name] = samurai_picture_scores(shown, reference, draw.lpips)
     values |= view_means(per_view)
     return {"metrics": entries(values, DEFINITIONS, baselines, PAPERS), "per_view": per_view}
 

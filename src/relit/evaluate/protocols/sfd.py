@@ -25,7 +25,7 @@ from relit.evaluate.baselines import CONSTANT, Baselines, Constants, chance, ran
 from relit.evaluate.lpips import Lpips
 from relit.evaluate.picture_figures import Draw
 from relit.evaluate.pile_alignment import frame_by_poses, scene_alignment
-from relit.evaluate.pile_views import PileViews, load_pile_truth, registered_poses
+from relit.evaluate.pile_views import COVERED, PileViews, load_pile_truth, registered_poses
 from relit.evaluate.results import PaperValue, entries, view_means
 from relit.evaluate.truth import Truth, camera_key, has_truth, load_truth, truth_kind
 from relit.geometry.se3 import nearest_rotation
@@ -34,7 +34,6 @@ from relit.scene import Asset, Camera
 KINDS = ("duplicates", "multiview")
 MEASURES = "piles of duplicates and multi-view captures with a truth"
 SAMPLES = 200_000  # points a surface, as `evaluate_meshes` draws
-COVERED = 0.5  # of a pixel, from which it belongs to a mask: the release has binary masks
 EPS = 1e-8  # added to the mean squared error in `mse2psnr`
 WINDOW = 7  # pixels; scikit-image's default
 
@@ -141,7 +140,9 @@ def psnr_of(a, b, where) -> float:
     return float(-10 * np.log10(error.mean() + EPS)) if error.size else float("nan")
 
 
-def picture_scores(shown, truth, inside, network, lpips: Lpips | None = None) -> dict[str, float]:
+def sfd_picture_scores(
+    shown, truth, inside, network, lpips: Lpips | None = None
+) -> dict[str, float]:
     """psnr, psnr_both, ssim, lpips of linear pictures (H, W, 3)."""
     a, b = m.gamma_encode(shown), m.gamma_encode(truth)
     out = {"psnr": psnr_of(a, b, inside), "psnr_both": psnr_of(a, b, inside & network)}
@@ -153,7 +154,7 @@ def picture_scores(shown, truth, inside, network, lpips: Lpips | None = None) ->
     return out
 
 
-def albedo_scores(shown, truth, inside, network) -> dict[str, float]:
+def sfd_albedo_scores(shown, truth, inside, network) -> dict[str, float]:
     """albedo_psnr and its variants of linear base colours (H, W, 3). The factor is that of the
     pixels that both masks hold; the release hands it on to the figure over the true mask."""
     a, b, both = m.gamma_encode(shown), m.gamma_encode(truth), inside & network
@@ -171,10 +172,10 @@ def roughness_mse(shown, truth, where) -> float:
     return float(error.mean()) if error.size else float("nan")
 
 
-def view_scores(view: SfdView, constants: Constants, lpips: Lpips | None) -> dict[str, float]:
+def sfd_view_scores(view: SfdView, constants: Constants, lpips: Lpips | None) -> dict[str, float]:
     """All figures of one view; its truth is added to `constants`."""
     both = view.inside & view.network
-    out = albedo_scores(*view.albedo, view.inside, view.network)
+    out = sfd_albedo_scores(*view.albedo, view.inside, view.network)
     out["roughness_mse"] = roughness_mse(*view.roughness, view.inside)
     out["roughness_mse_both"] = roughness_mse(*view.roughness, both)
     constants.add("roughness_mse", m.gamma_encode(view.roughness[1]), view.inside)
@@ -182,7 +183,7 @@ def view_scores(view: SfdView, constants: Constants, lpips: Lpips | None) -> dic
     constants.add("albedo_psnr_unscaled", m.gamma_encode(view.albedo[1]), view.inside)
     for key, pair in view.pictures.items():
         prefix, _, light = key.partition(":")
-        for name, value in picture_scores(*pair, view.inside, view.network, lpips).items():
+        for name, value in sfd_picture_scores(*pair, view.inside, view.network, lpips).items():
             out[f"{prefix}_{name}" + (f":{light}" if light else "")] = value
     return out
 
@@ -190,7 +191,7 @@ def view_scores(view: SfdView, constants: Constants, lpips: Lpips | None) -> dic
 def constant_albedo(view: SfdView) -> dict[str, float]:
     """What a base colour of one value scores: the protocol's factor makes it the best one."""
     flat = np.full_like(view.albedo[1], 0.5)
-    scores = albedo_scores(flat, view.albedo[1], view.inside, view.network)
+    scores = sfd_albedo_scores(flat, view.albedo[1], view.inside, view.network)
     return {name: scores[name] for name in ("albedo_psnr", "albedo_psnr_both")}
 
 
@@ -239,7 +240,7 @@ def pose_chance(true_poses: Mapping[int, np.ndarray], photo: Camera) -> Baseline
     return chance(drawn)
 
 
-def surface_score(mesh, true_mesh, true_from_mesh: np.ndarray, count: int = SAMPLES) -> float:
+def sfd_surface_score(mesh, true_mesh, true_from_mesh: np.ndarray, count: int = SAMPLES) -> float:
     """Chamfer-L1 in radii of the true object. mesh, true_mesh: (vertices, faces)."""
     own = m.sample_surface(*mesh, count, seed=0).samples
     true = m.sample_surface(*true_mesh, count, seed=1).samples
@@ -261,7 +262,7 @@ def evaluate_by_protocol(run: Path, folder: Path, draw: Draw) -> dict[str, Any]:
         kind, truth = "multiview", load_truth(folder)
         asset, _ = aligned(asset, truth.train, {camera_key(n): c for n, c in asset.cameras})
         mesh, true = (asset.mesh.vertices, asset.mesh.faces), true_surface(folder)
-        values = {"chamfer": surface_score(mesh, true, asset.world_from_asset)}
+        values = {"chamfer": sfd_surface_score(mesh, true, asset.world_from_asset)}
         baselines, views = {}, multiview_views(asset, truth, draw)
         light = truth.picture("environment")[..., :3]
     else:
@@ -272,7 +273,7 @@ def evaluate_by_protocol(run: Path, folder: Path, draw: Draw) -> dict[str, Any]:
         )
     per_view, flat = {}, {}
     for name, view in views:
-        per_view[name] = view_scores(view, constants, draw.lpips)
+        per_view[name] = sfd_view_scores(view, constants, draw.lpips)
         flat[name] = constant_albedo(view)
     if asset.environment is not None:
         values["environment_mse"] = m.environment_mse(asset.environment, light)
@@ -303,7 +304,7 @@ def _pile(asset: Asset, folder: Path, draw: Draw):
     middle = (points.min(0) + points.max(0)) / 2
     frame = frame_by_poses(poses, truth.poses, scale, own, middle)
     mesh = (asset.mesh.vertices, asset.mesh.faces)
-    values = {"chamfer": surface_score(mesh, (vertices, faces), np.linalg.inv(frame))}
+    values = {"chamfer": sfd_surface_score(mesh, (vertices, faces), np.linalg.inv(frame))}
     known = {k: p for k, p in truth.poses.items() if k in poses}
     visible = {i["label"] for i in truth.content["instances"] if i["visible"] > 0}
     values["registered"] = 100 * len(visible & set(known)) / max(len(visible), 1)
