@@ -261,7 +261,7 @@ def test_orb_error_is_over_the_frame_and_never_worse_than_grey():
     mask[:12] = 1  # eroded: 10 rows
     truth = flat(0.4, 0.4, 0.4)
     truth[:, ::2] = 0.6
-    value, _, _ = orb.compared(flat(1, 1, 1), truth, orb.eroded(mask), tone_mapped=False)
+    value, _, _ = orb.orb_psnr(flat(1, 1, 1), truth, orb.eroded(mask), tone_mapped=False)
     # the factor of a white picture is the mean: .5, as the grey picture; its error .01
     columns = orb.eroded(mask)[0]
     share = orb.eroded(mask).mean()
@@ -271,7 +271,7 @@ def test_orb_error_is_over_the_frame_and_never_worse_than_grey():
     assert value == pytest.approx(-10 * np.log10(min(error, floor)))
     bad = np.zeros((SIZE, SIZE, 3))
     bad[:, 1::2] = 1.0  # the wrong columns
-    worse, _, _ = orb.compared(bad, truth, orb.eroded(mask), tone_mapped=False)
+    worse, _, _ = orb.orb_psnr(bad, truth, orb.eroded(mask), tone_mapped=False)
     assert worse == pytest.approx(-10 * np.log10(floor))  # the floor
 
 

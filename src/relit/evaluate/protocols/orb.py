@@ -102,7 +102,7 @@ def least_squares_scale(shown, truth) -> np.ndarray:
     return (np.asarray(truth, np.float64) * x).sum(0) / np.maximum((x**2).sum(0), 1e-12)
 
 
-def compared(
+def orb_psnr(
     shown, truth, inside, *, limit: float = 1.0, renormalised: bool = False, tone_mapped: bool
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """(PSNR, recovered, true as compared) of linear pictures (H, W, 3): `calc_PSNR` with
@@ -124,17 +124,17 @@ def compared(
 def orb_picture_scores(shown, truth, mask, lpips: Lpips | None = None) -> dict[str, float]:
     """Of linear pictures (H, W, 3). mask: (H, W) true coverage."""
     inside = eroded(mask)
-    hdr, _, _ = compared(
+    hdr, _, _ = orb_psnr(
         shown, truth, inside, limit=HDR_LIMIT, renormalised=True, tone_mapped=False
     )
-    ldr, a, b = compared(shown, truth, inside, tone_mapped=True)
+    ldr, a, b = orb_psnr(shown, truth, inside, tone_mapped=True)
     out = {"psnr_hdr": hdr, "psnr_ldr": ldr, "ssim": float(m.ssim_map(a, b, RADIUS).mean())}
     return out if lpips is None else out | {"lpips": lpips(m.encode(a), m.encode(b))}
 
 
 def orb_albedo_scores(shown, truth, mask) -> dict[str, float]:
     """Of linear base colours (H, W, 3)."""
-    value, a, b = compared(shown, truth, eroded(mask), tone_mapped=False)
+    value, a, b = orb_psnr(shown, truth, eroded(mask), tone_mapped=False)
     return {"albedo_psnr": value, "albedo_ssim": float(m.ssim_map(a, b, RADIUS).mean())}
 
 
