@@ -102,7 +102,7 @@ def angles_between(a, b) -> np.ndarray:
     return np.degrees(np.arctan2(np.linalg.norm(off, axis=-1), trace - 1))
 
 
-def turned_about(centre, cameras: dict[str, Camera], rotations: np.ndarray) -> dict[str, Camera]:
+def turned_cameras(centre, cameras: dict[str, Camera], rotations: np.ndarray) -> dict[str, Camera]:
     """Each camera turned about a point (3,) by its rotation of (N, 3, 3): distance and aim stay."""
     out = {}
     for (name, camera), turn in zip(cameras.items(), rotations, strict=True):

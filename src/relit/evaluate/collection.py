@@ -17,7 +17,7 @@ from relit.conventions import move_points, similarity
 from relit.errors import UserError
 from relit.evaluate import definitions as common
 from relit.evaluate import metrics as m
-from relit.evaluate.alignment import LOST, align_centres, angles_between, turned_about
+from relit.evaluate.alignment import LOST, align_centres, angles_between, turned_cameras
 from relit.evaluate.baselines import Baselines, Constants, chance, random_rotations
 from relit.evaluate.lpips import Lpips
 from relit.evaluate.multiview import fixed_albedo_scale, material_figures, relit_figures
@@ -225,7 +225,7 @@ def camera_chance(
     both = {n: c for n, c in {**train, **test}.items() if n in found}
 
     def drawn(rng: np.random.Generator) -> dict[str, float]:
-        turned = turned_about(centre, both, random_rotations(len(both), rng))
+        turned = turned_cameras(centre, both, random_rotations(len(both), rng))
         values, per_view = camera_pose_figures(turned, train, test, centre)
         del values["focal_percent"], values["cameras"]
         return values | view_means(per_view)

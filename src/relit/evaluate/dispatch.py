@@ -54,7 +54,7 @@ def evaluate(
         )
     network = None if lpips is None else load_lpips(lpips)
     few, many = (SPP_PILE, SPP) if spp is None else (spp, spp)
-    samples = few if capture_kind(run_or_asset, folder) == "duplicates" else many
+    samples = few if kind_of_truth(run_or_asset, folder) == "duplicates" else many
     how = {"spp": samples, "seed": seed, "lpips": network}
     if protocol == "relit":
         result = _relit_figures(Path(run_or_asset), folder, how)
@@ -65,7 +65,7 @@ def evaluate(
     return {"protocol": protocol, **result}
 
 
-def capture_kind(run_or_asset: str | Path, folder: Path) -> str:
+def kind_of_truth(run_or_asset: str | Path, folder: Path) -> str:
     """'multiview', 'flash', 'duplicates' or 'collection': by the truth, else by the asset."""
     from relit.asset.asset import load_asset
     from relit.evaluate.flash import is_flash_truth
@@ -125,7 +125,7 @@ def _protocol_figures(
     from relit.evaluate.protocols import orb, pir, samurai, sfd
 
     kind, modules = (
-        capture_kind(run, folder),
+        kind_of_truth(run, folder),
         {"sfd": sfd, "pir": pir, "samurai": samurai, "orb": orb},
     )
     module = modules[protocol]

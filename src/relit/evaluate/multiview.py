@@ -13,7 +13,7 @@ import numpy as np
 
 from relit.conventions import move_pose
 from relit.evaluate import metrics as m
-from relit.evaluate.alignment import align_named_cameras, aligned, pose_errors, turned_about
+from relit.evaluate.alignment import align_named_cameras, aligned, pose_errors, turned_cameras
 from relit.evaluate.baselines import Constants, chance, random_rotations
 from relit.evaluate.definitions import DEFINITIONS
 from relit.evaluate.environments import environment_figures
@@ -117,7 +117,7 @@ def _camera_chance(
     same alignment."""
     names = {n: truth.train[n] for n in found if n in truth.train}
     centre = truth.meta["sphere"].get("centre", (0.0, 0.0, 0.0))
-    turned = turned_about(centre, names, random_rotations(len(names), rng))
+    turned = turned_cameras(centre, names, random_rotations(len(names), rng))
     frame = align_named_cameras(turned, truth.train)
     moved = {n: c.with_pose(move_pose(frame, c.world_from_camera)) for n, c in turned.items()}
     return _camera_figures(moved, truth)

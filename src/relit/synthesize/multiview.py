@@ -28,7 +28,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -144,11 +144,7 @@ def synthesize_multiview(
     shots = [] if delivery is None else delivered_shots(delivery, train, seed)
     train = pinholes(shots) or train
     write_mesh(truth / "mesh.ply", mesh, thing.world_from_asset)
-    if delivery is None:
-        _write_transforms(out / "transforms_train.json", train, resolution)
-        _write_transforms(out / "transforms_test.json", test, resolution)
-    else:
-        write_cameras(out, delivery, shots, test)
+    _write_all_cameras(out, delivery, shots, (train, test), resolution)
 
     def lit(file: Path) -> tuple[TruthScene, np.ndarray]:
         """Scene under a light whose exposure fits the object, and that light."""
@@ -160,21 +156,9 @@ def synthesize_multiview(
         train[i][0]
         for i in np.unique(np.linspace(0, views - 1, min(SCALE_VIEWS, views)).round().astype(int))
     ]
-    light = environment
-
-    def take(camera: Camera, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        return in_front_of(light, camera, radiance(scene, camera, samples, max_depth, seed))
-
-    for i, (name, camera) in enumerate(train):
-        if delivery is None:
-            write_training_view(
-                out, scene, name, camera, spp, max_depth, seed * 1_000_003 + i, name in scale_names
-            )
-        else:
-            write_photo(out, delivery, name, shots[i][1], take, spp)
-            if name in scale_names:
-                write_scale_view(out, scene, name, camera)
-        tell_progress(say, "training photo", i, views)
+    plan = _TrainingPlan(train, shots, delivery, scale_names)
+    sampling = _Sampling(spp, test_spp, max_depth, seed, say)
+    _write_training_photos(out, scene, environment, plan, sampling)
     for i, (name, camera) in enumerate(test):
         write_test_view(
             out, scene, name, camera, test_spp, max_depth, seed * 1_000_003 + 500_000 + i
@@ -187,45 +171,98 @@ def synthesize_multiview(
         folder = truth / "relight" / file.stem
         write_linear(folder.with_suffix(".exr"), environment)
         for i, (name, camera) in enumerate(test):
+            number = seed * 1_000_003 + 600_000 + 1000 * j + i
             target = folder / f"{Path(name).name}.exr"
-            if not target.exists():
-                write_linear(
-                    target,
-                    radiance(
-                        scene,
-                        camera,
-                        test_spp,
-                        max_depth,
-                        seed * 1_000_003 + 600_000 + 1000 * j + i,
-                    ),
-                )
+            _write_radiance(target, scene, camera, test_spp, max_depth, number)
             tell_progress(say, f"test view under {file.stem}", i, test_views)
         scene.close()
 
-    def pictures(folder: Path) -> list[tuple[Path, Camera]]:
-        return [(folder / f"{Path(name).name}.exr", camera) for name, camera in test]
-
-    relit = {file.stem: truth / "relight" / file.stem for file in relights}
-    lights = {"capture": (truth / "environment.exr", pictures(truth / "test"))} | {
-        name: (folder.with_suffix(".exr"), pictures(folder)) for name, folder in relit.items()
-    }
+    names = [name for name, _ in test]
     write_json(
         truth / "truth.json",
         {
             "settings": settings,
             "renderer": made_by,
-            "ceiling": ceilings(thing, lights, test_spp, seed, say),
+            "ceiling": ceilings(thing, _lights_of(truth, relights, test), test_spp, seed, say),
             "world_from_asset": thing.world_from_asset.tolist(),
             "sphere": {"centre": [0.0, 0.0, 0.0], "radius": RADIUS},
             "ior": material.ior,
             "train": [name for name, _ in train],
-            "test": [name for name, _ in test],
+            "test": names,
             "train_albedo": [Path(n).name for n in scale_names],
             "relight": [file.stem for file in relights],
             **delivery_truth(out, delivery, shots),
         },
     )
     return out
+
+
+@dataclass(frozen=True)
+class _Sampling:
+    """Samples a pixel of training photos and of what is measured against, the longest path, the
+    seed, and who hears of the progress."""
+
+    spp: int
+    test_spp: int
+    max_depth: int
+    seed: int
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class _TrainingPlan:
+    """cameras: (name, camera) of the training photos. shots: what `delivery` makes of them. scale:
+    names of the views whose albedo is kept."""
+
+    cameras: Sequence[tuple[str, Camera]]
+    shots: Sequence[Any]
+    delivery: Delivery | None
+    scale: Sequence[str]
+
+
+def _write_training_photos(
+    out: Path, scene: TruthScene, light: np.ndarray, plan: _TrainingPlan, sampling: _Sampling
+) -> None:
+    """The training photos, as they are delivered."""
+    depth, spp = sampling.max_depth, sampling.spp
+
+    def take(camera: Camera, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        return in_front_of(light, camera, radiance(scene, camera, samples, depth, seed))
+
+    for i, (name, camera) in enumerate(plan.cameras):
+        keep = name in plan.scale
+        if plan.delivery is None:
+            number = sampling.seed * 1_000_003 + i
+            write_training_view(out, scene, name, camera, spp, depth, number, keep)
+        else:
+            write_photo(out, plan.delivery, name, plan.shots[i][1], take, spp)
+            if keep:
+                write_scale_view(out, scene, name, camera)
+        tell_progress(sampling.say, "training photo", i, len(plan.cameras))
+
+
+def _write_radiance(
+    target: Path, scene: TruthScene, camera: Camera, spp: int, max_depth: int, seed: int
+) -> None:
+    """Render `target`, unless it is there."""
+    from relit.images import write_linear
+
+    if not target.exists():
+        write_linear(target, radiance(scene, camera, spp, max_depth, seed))
+
+
+def _lights_of(
+    truth: Path, relights: Sequence[Path], test: Sequence[tuple[str, Camera]]
+) -> dict[str, tuple[Path, list[tuple[Path, Camera]]]]:
+    """For each light of a capture its file and the test pictures under it."""
+
+    def pictures(folder: Path) -> list[tuple[Path, Camera]]:
+        return [(folder / f"{Path(name).name}.exr", camera) for name, camera in test]
+
+    folders = {file.stem: truth / "relight" / file.stem for file in relights}
+    return {"capture": (truth / "environment.exr", pictures(truth / "test"))} | {
+        name: (folder.with_suffix(".exr"), pictures(folder)) for name, folder in folders.items()
+    }
 
 
 # ---------------------------------------------------------------- where things stand
@@ -478,6 +515,17 @@ def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically, its folder made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(content, indent=1))
+
+
+def _write_all_cameras(
+    out: Path, delivery: Delivery | None, shots, cameras: tuple[list, list], resolution: int
+) -> None:
+    """The camera files of the training and the test views, as they are delivered."""
+    if delivery is not None:
+        write_cameras(out, delivery, shots, cameras[1])
+        return
+    for split, some in zip(("train", "test"), cameras, strict=True):
+        _write_transforms(out / f"transforms_{split}.json", some, resolution)
 
 
 def _write_transforms(path: Path, cameras: Sequence[tuple[str, Camera]], resolution: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from relit.conventions import move_points
 from relit.errors import UserError
 from relit.evaluate import metrics as m
-from relit.evaluate.alignment import align_centres, angles_between, turned_about
+from relit.evaluate.alignment import align_centres, angles_between, turned_cameras
 from relit.evaluate.baselines import Baselines, chance, random_rotations
 from relit.evaluate.collection import (
     cameras_and_lights,
@@ -103,7 +103,7 @@ def camera_chance_of(
     known = {n: c for n, c in train.items() if n in found}
 
     def drawn(rng: np.random.Generator) -> dict[str, float]:
-        turned = turned_about(centre, known, random_rotations(len(known), rng))
+        turned = turned_cameras(centre, known, random_rotations(len(known), rng))
         scores = camera_scores(turned, known)
         return {k: scores[k] for k in ("rotation_mean", "translation_mean")}
 
