@@ -10,8 +10,8 @@ from relit.cameras.links import Group
 from relit.conventions import similarity
 from relit.errors import UserError
 from relit.fit.collection.options import CollectionOptions
-from relit.fit.collection.photo_poses import PoseEvidence, find_all
-from relit.fit.collection.photos import CollectionPhoto, PhotoSet
+from relit.fit.collection.photo_poses import PoseEvidence, find_all, supported
+from relit.fit.collection.photos import CollectionPhoto, PhotoSet, collection_crops
 from relit.fit.collection.verdict import check_borne_out, contradictions
 from relit.geometry.se3 import camera_errors, exp_so3, look_at
 from relit.recipe import FitContext
@@ -81,16 +81,25 @@ def test_wrong_links_do_not_win_against_the_search(photos, tmp_path):
 
 
 @pytest.mark.slow
-def test_right_links_are_kept(photos, tmp_path):
+def test_right_links_have_evidence(photos, tmp_path):
+    """More than the same photos at wrong poses, so that these cannot win."""
     shots, truth = photos
-    best, said = found(shots, group_at(truth), tmp_path / "run")
-    assert np.median(camera_errors(best.poses, truth)[0]) < 5, said
+    wrong = truth[np.random.default_rng(1).permutation(COUNT)]
+    crops, none = collection_crops(shots.shots), np.zeros(COUNT, bool)
+    with Run.open(tmp_path, {}) as run:
+        fit = FitContext(run, OPTIONS, 0)
+        right, other = (
+            supported("matches", shots.shots, crops, (poses, np.full(COUNT, 0.95), none), fit)
+            for poses in (truth, wrong)
+        )
+    assert right.evidence.total > other.evidence.total + 0.3
 
 
 def test_evidence_adds_up_what_was_measured():
-    assert PoseEvidence(0.9, 0.8, 0.5).total == pytest.approx(2.2)
-    assert PoseEvidence(0.9, float("nan"), 0.5).total == pytest.approx(1.4)
-    assert PoseEvidence(0.9, 0.8, 0.8).clear and not PoseEvidence(0.9, float("nan"), 1.0).clear
+    none = float("nan")
+    assert PoseEvidence(0.9, 0.8, 0.5, 0.7).total == pytest.approx(2.2)
+    assert PoseEvidence(0.9, none, 0.5, 0.7).total == pytest.approx(1.4)
+    assert PoseEvidence(0.9, 0.8, 0.4, 0.8).clear and not PoseEvidence(0.9, none, 0.4, 1.0).clear
 
 
 def test_a_result_that_all_evidence_contradicts_is_refused(photos, tmp_path):

@@ -308,7 +308,7 @@ def test_verdicts(tmp_path):
 
     def judged(scores, share):
         count = len(scores)
-        evidence = PoseEvidence(float(np.mean(scores)), share, np.nan)
+        evidence = PoseEvidence(float(np.mean(scores)), share, np.nan, np.nan)
         poses, none = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
         found = PhotoPoses(poses, scores, none, np.ones(count), "search", evidence)
         with Run.open(tmp_path / "run", {}) as run:

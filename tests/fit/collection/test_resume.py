@@ -30,7 +30,7 @@ from support import flash_ball as scene
 
 def test_poses_that_were_refused_are_refused_again(tmp_path, monkeypatch):
     photos = SimpleNamespace(names=[f"{i}.jpg" for i in range(6)])
-    evidence = photo_poses.PoseEvidence(0.4, np.nan, np.nan)
+    evidence = photo_poses.PoseEvidence(0.4, np.nan, np.nan, np.nan)
     poses, none = np.tile(np.eye(4), (6, 1, 1)), np.zeros(6, bool)
     found = photo_poses.PhotoPoses(poses, np.full(6, 0.4), none, np.ones(6), "search", evidence)
     searched = []

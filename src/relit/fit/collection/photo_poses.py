@@ -42,27 +42,29 @@ class PoseEvidence:
 
     score: mean of the registration (silhouettes and colours normalised for light), 1 is perfect.
     agreement: share of the photos that a search without hints puts where they are, in a model of the
-    other half of them; NaN where it was not measured. detail: share of the photos that show in fine
-    detail what the others show at the same places (correlation of BORNE_OUT and more).
+    other half of them; NaN where it was not measured. detail: mean correlation of what each photo
+    shows in fine detail with what the others show at the same places, negative ones as 0; NaN where
+    it was not measured. borne_out: share of the photos whose correlation is BORNE_OUT and more.
     """
 
     score: float
     agreement: float
     detail: float
+    borne_out: float
 
     @property
     def total(self) -> float:
-        """Sum of what was measured, all counted alike."""
+        """Sum of score, agreement and detail, as far as they were measured."""
         return float(np.nansum([self.score, self.agreement, self.detail]))
 
     @property
     def clear(self) -> bool:
         """Whether agreement and detail both bear out nearly all poses."""
-        return self.agreement >= CLEAR and self.detail >= CLEAR
+        return self.agreement >= CLEAR and self.borne_out >= CLEAR
 
     def __str__(self) -> str:
         share = "not measured" if np.isnan(self.agreement) else f"{self.agreement:.0%}"
-        return f"score {self.score:.3f}, agreement {share}, fine detail {self.detail:.0%}"
+        return f"score {self.score:.3f}, agreement {share}, fine detail {self.detail:.2f}"
 
 
 @dataclass(frozen=True)
@@ -186,27 +188,27 @@ def supported(
     """The solution with its evidence. found: (poses, scores, linked)."""
     poses, scores, linked = found
     searched = "search" not in fit.options.without
-    agreement = detail = float("nan")
+    agreement = detail = borne_out = float("nan")
     if searched and len(shots) >= CHECKED:
         agreement = float(cross_validated_share(crops, poses, fit.seed))
     if searched:
-        detail = detail_share(shots, crops, poses, fit)
-    evidence = PoseEvidence(float(np.mean(scores)), agreement, detail)
+        each = shared_detail(shots, crops, poses, fit)
+        detail, borne_out = float(np.maximum(each, 0).mean()), float((each >= BORNE_OUT).mean())
+    evidence = PoseEvidence(float(np.mean(scores)), agreement, detail, borne_out)
     focals = np.array([s.camera.fx for s in shots])
     return PhotoPoses(poses, scores, linked, focals, source, evidence)
 
 
-def detail_share(
+def shared_detail(
     shots: Sequence[CollectionPhoto], crops, poses: np.ndarray, fit: FitContext
-) -> float:
-    """Share of the photos that show in fine detail what the others show there, on the surface of a
-    coarse model of all."""
+) -> np.ndarray:
+    """(P,) correlation of what each photo shows in fine detail with what the others show there, on
+    the surface of a coarse model of all (`detail_correlation`)."""
     placed = gauge(crops, poses)
     model = coarse_model(crops, placed, NODES, STEPS, TOLERANCE, fit.seed)
     surface = surface_of(extract_mesh(dense_values(model.grid), faces=FACES))
     cameras = [s.camera.with_pose(p) for s, p in zip(shots, placed, strict=True)]
-    pictures = [detail_of(s.rgb, s.mask) for s in shots]
-    return float((detail_correlation(surface, pictures, cameras) >= BORNE_OUT).mean())
+    return detail_correlation(surface, [detail_of(s.rgb, s.mask) for s in shots], cameras)
 
 
 def judge_poses(found: PhotoPoses, names: Sequence[str], options: CollectionOptions, run) -> None:
