@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ from relit.cameras.matcher import (
 )
 from relit.cameras.rotation_sweep import Features
 from relit.errors import UserError
+from relit.fit.duplicates.options import DuplicatesOptions
+from relit.fit.duplicates.poses import match_instances
 from relit.geometry.se3 import exp_so3, rotation_angle
 from relit.scene import Camera
 
@@ -88,33 +91,26 @@ def test_a_matcher_links_two_objects(monkeypatch):
     assert rotation_angle(link.rotation.T @ turns[1] @ turns[0].T) < 1.5
 
 
-def test_the_step_is_a_setting_of_the_recipe(monkeypatch):
-    from types import SimpleNamespace
-
-    import relit.cameras.matcher as module
-    from relit.fit.duplicates import poses as duplicates_poses
-    from relit.fit.duplicates.options import DuplicatesOptions
-
-    def link(matcher, windows, cameras, error, *, sweep, step):
-        steps.append(step)
-        raise StopIteration
-
-    steps = []
-    view = SimpleNamespace(
-        photo=0,
-        camera=Camera(8, 8, 9.0, 9.0, 4, 4, np.eye(4)),
-        rgb=np.zeros((8, 8, 3)),
-        mask=np.ones((8, 8)),
+def test_the_step_is_a_setting_of_the_recipe(tmp_path, monkeypatch):
+    """A matcher that finds nothing is asked once for each turn of the sweep."""
+    (tmp_path / "counting_matcher.py").write_text(
+        "asked = []\ndef match(a, b):\n    asked.append(1)\n    return [], []\n"
     )
-    monkeypatch.setattr(module, "link_by_matcher", link)
-    monkeypatch.setattr(module, "load_matcher", lambda name: None)
-    monkeypatch.setattr(duplicates_poses, "all_views", lambda *_: [view])
-    for given, step in (({}, 24), ({"matcher_step": 4}, 4)):
-        with pytest.raises(StopIteration):
-            duplicates_poses.match_instances(
-                [(None, view.camera)], None, DuplicatesOptions(matcher="a:b", **given), 0
-            )
-        assert steps.pop() == step
+    monkeypatch.syspath_prepend(tmp_path)
+    labels = np.zeros((40, 90), np.int32)
+    labels[10:30, 10:30], labels[10:30, 50:70] = 1, 2
+    photo = SimpleNamespace(rgb=np.full((40, 90, 3), 0.5, np.float32), labels=labels, normal=None)
+    shots = [(photo, Camera(90, 40, 90.0, 90.0, 45, 20, np.eye(4)))]
+    run = SimpleNamespace(say=lambda text: None)
+    counts = []
+    for given in ({}, {"matcher_step": 4}):
+        options = DuplicatesOptions(matcher="counting_matcher:match", **given)
+        assert match_instances(shots, run, options, 0).links == {}
+        asked = sys.modules["counting_matcher"].asked
+        counts.append(len(asked))
+        asked.clear()
+    del sys.modules["counting_matcher"]
+    assert 15 <= counts[0] <= 18 and 90 <= counts[1] <= 93
     for wrong in (0, 7, 100):
         with pytest.raises(ValueError, match="divisor"):
             DuplicatesOptions(matcher_step=wrong)

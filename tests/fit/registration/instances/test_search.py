@@ -568,7 +568,8 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
     from relit.fit.registration.instances import rounds as instance_rounds
 
     views, truth = painted([0, 20, 40, 60, 80, 100])
-    crops, o, said, members = instance_crops(views), Search(nodes=24, steps=12), [], []
+    crops, said, members = instance_crops(views), [], []
+    o = Search(nodes=24, steps=12, descents=1, descent_rate=1e-9)
 
     def grown(views, crops, rings, parts, rest, poses, *_, **__):
         assert parts == DETAILED
@@ -577,9 +578,6 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
 
     monkeypatch.setattr(instance_rounds, "LOW", LOW / 2)  # eight colours tell less than a print
     monkeypatch.setattr(instance_rounds, "grow_instances", grown)
-    monkeypatch.setattr(
-        instance_rounds, "refine_jointly", lambda v, c, r, poses, scores, *_, **__: (poses, scores)
-    )
     poses = truth.copy()
     for k in (1, 2):
         poses[k] = (
@@ -591,50 +589,45 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
     assert members == [[0, 3, 4, 5]] and said[0].startswith(
         f"{views[1].label}, {views[2].label} taken out together"
     )
-    assert np.array_equal(found, truth) and scores.tolist() == [1.0] * 6
+    assert np.allclose(found, truth, atol=1e-6) and scores.min() > 0.8
 
 
 def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch):
+    """Two stand in wrong places, and growth would put the others into wrong places as well. The
+    judge is real."""
     from relit.fit.registration.instances import rounds as instance_rounds
 
-    views, truth = painted([0, 20, 40, 60])
-    crops = instance_crops(views)
+    views, truth = painted([0, 20, 40, 60, 80, 100])
+    crops, asked = instance_crops(views), []
+    o = Search(nodes=24, steps=12, descents=1, descent_rate=1e-9)
     rings = crop_rings(crops, DETAILED)
-    for own, asked in (([0.9, 0.9, 0.85, 0.9], False), ([0.9, 0.9, 0.3, 0.9], True)):
-        judged = iter([np.array(own), np.array(own) - 0.1])
-        monkeypatch.setattr(
-            instance_rounds, "model_of_all", lambda *_, judged=judged, **__: (None, next(judged))
-        )
-        monkeypatch.setattr(
-            instance_rounds,
-            "refine_jointly",
-            lambda v, c, r, poses, scores, *_, **__: (poses + 1, scores),
-        )
-        monkeypatch.setattr(
-            instance_rounds,
-            "grow_instances",
-            lambda v, c, r, p, rest, poses, *_, **__: Grown(poses + 1, np.ones(len(poses)), (), ()),
-        )
-        said: list[str] = []
-        poses, _ = regrown(
-            views, crops, rings, truth.copy(), np.ones(4), Search(), seed=0, say=said.append
-        )
-        assert np.array_equal(poses, truth) and bool(said) == asked
+    turns = [exp_so3(np.array([0.0, np.radians(a), 0.0])) for a in (90, 110, 110, -100, 70, -60)]
+    wrong = np.array([similarity(r, np.zeros(3)) @ p for r, p in zip(turns, truth, strict=True)])
+
+    def grown(views, crops, rings, parts, rest, poses, *_, **__):
+        asked.append(rest)
+        return Grown(wrong.copy(), np.ones(6), tuple(rest), ())
+
+    monkeypatch.setattr(instance_rounds, "LOW", LOW / 2)  # eight colours tell less than a print
+    monkeypatch.setattr(instance_rounds, "grow_instances", grown)
+    begun = truth.copy()
+    begun[1:3] = wrong[1:3]
+    for start, out in ((truth, []), (begun, [[0, 3, 4, 5]])):
+        asked.clear()
+        poses, _ = regrown(views, crops, rings, start.copy(), np.ones(6), o, seed=0)
+        assert np.array_equal(poses, start) and asked == out
 
 
-def test_silhouettes_without_anything_in_common_are_left_as_they_are(monkeypatch):
-    from relit.fit.registration.instances import rounds as instance_rounds
-
-    def nothing(*_, **__):
-        raise NoShape("the occupancy is empty or full")
-
+def test_silhouettes_without_anything_in_common_are_left_as_they_are():
     views, truth = painted([0, 20, 40, 60])
-    crops = instance_crops(views)
-    monkeypatch.setattr(instance_rounds, "model_of_all", nothing)
+    crops, apart = instance_crops(views), truth.copy()
+    apart[:, 0, 3] += [0.0, 3.0, 6.0, 9.0]  # no two see the same place
+    with pytest.raises(NoShape):
+        carved(views, apart, 32, 0.15, 2.5, crossed=True)
     poses, _ = regrown(
-        views, crops, crop_rings(crops, DETAILED), truth, np.ones(4), Search(), seed=0
+        views, crops, crop_rings(crops, DETAILED), apart.copy(), np.ones(4), Search(), seed=0
     )
-    assert np.array_equal(poses, truth)
+    assert np.array_equal(poses, apart)
 
 
 def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead():
