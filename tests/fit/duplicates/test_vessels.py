@@ -190,7 +190,7 @@ def asked(folder, profile, monkeypatch):
     )
     truth = json.loads((photo / "truth" / "truth.json").read_text())
     scale = scale_of(np.array(truth["instances"][0]["world_from_object"]))
-    options = small_options(levels=(24, N), level_steps=(10, 10), surface_steps=320, points=2048)
+    options = small_options(levels=(24, N), level_steps=(10, 10), surface_steps=120, points=1024)
     capture = open_capture(photo)
     shots = [(p.load(), p.camera.with_pose(np.eye(4))) for p in capture.photos]
     views, poses = all_views(shots, 160, options), true_poses(photo)
