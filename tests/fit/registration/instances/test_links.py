@@ -15,6 +15,7 @@ from relit.fit.registration.register import crop_rings
 from relit.geometry.se3 import exp_so3
 from support.painted_ellipsoid import painted
 
+SMALL = Growth(nodes=28, steps=50, viewpoints=300, keep=3)
 HALF = similarity(exp_so3(np.array([0, np.pi, 0])), np.zeros(3))
 
 
@@ -27,7 +28,7 @@ def linked():
 def asked(views, poses, members):
     crops = instance_crops(views)
     return verified_links(
-        views, crops, crop_rings(crops, DETAILED), DETAILED, (members, poses), (), Growth(), 0
+        views, crops, crop_rings(crops, DETAILED), DETAILED, (members, poses), (), SMALL, 0
     )
 
 

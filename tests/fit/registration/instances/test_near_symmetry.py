@@ -28,7 +28,7 @@ from relit.fit.registration.instances.near_symmetry_search import (
     motions_about,
     stands,
 )
-from relit.fit.registration.instances.options import DETAILED, Search
+from relit.fit.registration.instances.options import DETAILED, Growth, Search
 from relit.fit.registration.instances.regrowth import Placed
 from relit.fit.registration.instances.silhouette_turns import Silhouettes
 from relit.fit.registration.instances.views import instance_crops
@@ -42,6 +42,7 @@ SPOUT = (np.array([0.5, 0.1, 0.0]), np.array([0.22, 0.06, 0.06]))
 HANDLE = (np.array([-0.42, 0.0, 0.0]), np.array([0.14, 0.28, 0.05]))
 HALF = similarity(exp_so3(np.array([0, np.pi, 0])), np.zeros(3))
 ABOUT_Y = AlikeTurn(np.array([0.0, 1.0, 0.0]), 2, 1.0)
+SMALL = Search(nodes=28, steps=25, growth=Growth(nodes=32, steps=50, viewpoints=300))
 WRONG = np.array([0, 1, 1, 0, 0, 1, 0, 1])
 
 
@@ -76,7 +77,7 @@ def errors(poses, true):
 
 def test_a_model_of_it_looks_most_like_itself_after_half_a_turn(pots):
     views, poses = pots
-    best, *others = alike_turns(model_at(views, poses, Search(), 0).gallery, 3)
+    best, *others = alike_turns(model_at(views, poses, SMALL, 0).gallery, 3)
     assert (
         best.order == 2
         and abs(best.axis[1]) > 0.99
@@ -127,18 +128,18 @@ def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monk
     rings = crop_rings(crops, DETAILED)
     off = turned(poses, WRONG)
     assert (errors(off, poses) > 170).sum() == 4
-    found = coherent_turns(views, crops, rings, off, Search(), seed=0, say=said.append)
+    found = coherent_turns(views, crops, rings, off, SMALL, seed=0, say=said.append)
     assert (
         errors(found.poses, poses).max() < 8
         and "4 of 8 were turned" in said[0]
         and len(found.rotations) == 2
     )
-    assert coherent_turns(views, crops, rings, poses, Search(), seed=0) is None
-    assert all(stands(views, crops, rings, found, k, Search(), 0) for k in (0, 3))
+    assert coherent_turns(views, crops, rings, poses, SMALL, seed=0) is None
+    assert all(stands(views, crops, rings, found, k, SMALL, 0) for k in (0, 3))
     astray = found.poses.copy()
     astray[3] = similarity(exp_so3(np.array([0.9, 0, 0.4])), np.zeros(3)) @ astray[3]
     assert not stands(
-        views, crops, rings, Turned(astray, found.own, found.value, found.rotations), 3, Search(), 0
+        views, crops, rings, Turned(astray, found.own, found.value, found.rotations), 3, SMALL, 0
     )
 
 
@@ -147,7 +148,7 @@ def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
     views, poses = pots
     crops, off = instance_crops(views), turned(poses, WRONG)
     found = coherent_turns(
-        views, crops, crop_rings(crops, DETAILED), off, Search(), seed=0, exact=True
+        views, crops, crop_rings(crops, DETAILED), off, SMALL, seed=0, exact=True
     )
     assert errors(found.poses, poses).max() < 3
     moved = (found.poses != off).any((1, 2))
@@ -194,7 +195,7 @@ def test_an_object_that_looks_like_itself_all_the_way_is_left_alone():
     crops = instance_crops(views)
     assert (
         coherent_turns(
-            views, crops, crop_rings(crops, DETAILED), turned(poses, WRONG), Search(), seed=0
+            views, crops, crop_rings(crops, DETAILED), turned(poses, WRONG), SMALL, seed=0
         )
         is None
     )
@@ -210,7 +211,7 @@ def test_who_stands_up_to_such_turns_is_no_longer_unsure(pots, monkeypatch):
     placed = Placed(turned(poses, WRONG), np.ones(8), (0, 1), (2, 4), DETAILED)
     told = iter([found, None])
     monkeypatch.setattr(instance_search, "coherent_turns", lambda *_, **__: next(told))
-    best = instance_search.up_to_turns(views, crops, placed, Search(), seed=0)
+    best = instance_search.up_to_turns(views, crops, placed, SMALL, seed=0)
     assert np.array_equal(best.poses, found.poses) and best.unsure == (4,)
     assert best.agreement == found.own.mean()
-    assert instance_search.up_to_turns(views, crops, placed, Search(), seed=0) is placed
+    assert instance_search.up_to_turns(views, crops, placed, SMALL, seed=0) is placed
