@@ -18,13 +18,14 @@ environment:
 demo: setup
 	$(NICE) $(VENV)/bin/python -m relit demo -o runs/demo
 
-# all tests; files of tests run side by side, one thread each
+# all tests, side by side, one thread each; a worker that is done takes tests from another
+PYTEST = $(NICE) $(VENV)/bin/python -m pytest -q -n $(WORKERS) --dist worksteal
 test: setup validator
-	$(NICE) $(VENV)/bin/python -m pytest -q -n $(WORKERS) --dist loadfile
+	$(PYTEST)
 
-# the tests without the marker `slow`
+# the tests without the marker `slow`: two minutes on two cores
 test-quick: environment
-	$(NICE) $(VENV)/bin/python -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow"
+	$(PYTEST) -m "not slow"
 
 lint: environment
 	$(VENV)/bin/python -m ruff check .

@@ -32,6 +32,7 @@ def asset(tmp_path_factory):
     return relit.load(folder)
 
 
+@pytest.mark.slow
 def test_from_photos_to_an_asset(tmp_path):
     folder = write_capture(tmp_path / "photos")
     capture = relit.open_capture(folder)

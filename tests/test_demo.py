@@ -30,6 +30,7 @@ def folder(tmp_path, monkeypatch, report_sizes):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_demo_ends_with_a_glb_a_report_and_scores(folder, capsys):
     run = module.demo(folder, device="cpu")
     assert run == folder / "run"

@@ -123,6 +123,7 @@ def test_an_inserted_object_stands_on_the_ground_and_darkens_it(run, tmp_path):
         mesh_on_ground(asset.mesh, asset, look_up, (36, 5), 1.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["collection", "flash"])
 def test_a_photo_is_changed_under_its_own_light(run, tmp_path, kind):
     """Of a collection it is four times as bright as the median of the lights; of a flash capture

@@ -154,6 +154,7 @@ def capture(tmp_path):
     return write_capture(tmp_path / "photos")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "spoil, code, said", FAULTS, ids=lambda v: v.__name__ if callable(v) else None
 )

@@ -178,6 +178,7 @@ FAULTS = [
 KINDS = {flash_capture: "flash", pile: "duplicates", collection: "collection"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make, spoil, flags, code, said", FAULTS, ids=lambda v: v.__name__ if callable(v) else None
 )

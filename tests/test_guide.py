@@ -52,6 +52,7 @@ def example(monkeypatch, capsys, number, *argv) -> str:
     return capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_examples_in_order(monkeypatch, capsys, folder, report_sizes):
     import relit.fit.multiview.recipe as multiview
 

@@ -106,6 +106,7 @@ def test_a_tiff_of_absurd_width_is_told(tmp_path):
         read_image(tmp_path / "a.tif")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["a.exr", "a.hdr", "a.png", "b.png", "c.png", "a.jpg", "a.tif", "a.webp"]
 )

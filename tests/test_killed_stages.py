@@ -200,6 +200,7 @@ JOBS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make, stages", JOBS, ids=lambda v: v.__name__ if callable(v) else None)
 def test_kill_9_in_one_stage_after_the_other(tmp_path, make, stages):
     photos, flags = make(tmp_path / "Fotos für später (1)")

@@ -106,6 +106,7 @@ Run.stage = stage
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["volume", "mesh", "surface", "asset", "report"])
 def test_kill_9_in_any_stage_and_the_same_command(capsys, capture, finished, tmp_path, stage):
     run = tmp_path / "run"
@@ -134,6 +135,7 @@ def test_kill_9_in_any_stage_and_the_same_command(capsys, capture, finished, tmp
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_asked_to_stop(capture, tmp_path, number, code):
     run = tmp_path / "run"
@@ -180,6 +182,7 @@ def test_what_a_finished_stage_has_kept_was_damaged(capsys, capture, finished, t
     assert "--overwrite" in err
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up(capsys, capture, tmp_path):
     """A limit on the size of files stands for a full disk: the same OSError from the same calls."""
     run = tmp_path / "run"
@@ -200,6 +203,7 @@ def test_an_output_that_cannot_be_written(capsys, capture):
     answered(code, err, 5, "cannot be made")
 
 
+@pytest.mark.slow
 def test_a_photo_replaced_during_the_run(capture, tmp_path):
     photos, run = tmp_path / "photos", tmp_path / "run"
     shutil.copytree(capture, photos)
@@ -245,6 +249,7 @@ def test_a_run_folder_that_was_moved(capsys, capture, finished, tmp_path):
     assert code == 0 and "complete" in err
 
 
+@pytest.mark.slow
 def test_two_gigabytes_of_memory(capture, tmp_path):
     """Data segments and anonymous memory together: a draft goes through."""
     process = start(
@@ -259,6 +264,7 @@ def test_two_gigabytes_of_memory(capture, tmp_path):
     assert process.returncode == 0, err
 
 
+@pytest.mark.slow
 def test_memory_that_runs_out(capture, tmp_path):
     """An answer, no traceback, and never a half written asset."""
     process = start(
@@ -277,6 +283,7 @@ def test_memory_that_runs_out(capture, tmp_path):
         answered(process.returncode, err, 5, "memory")
 
 
+@pytest.mark.slow
 def test_a_photo_of_a_hundred_megapixels(tmp_path, capsys):
     folder = write_capture(tmp_path / "photos")
     Image.fromarray(np.asarray(Image.open(folder / "images/p0.png"))[..., :3]).resize(
@@ -306,6 +313,7 @@ sys.addaudithook(watch)
 """
 
 
+@pytest.mark.slow
 def test_nothing_reaches_for_the_network(capture, tmp_path):
     words = ["reconstruct", capture, "-o", tmp_path / "run", *WORDS]
     done = subprocess.run(
@@ -345,6 +353,7 @@ for name in {n for n, _ in seen}:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "masks, passes", [("auto", {"volume", "surface"}), ("none", {"explore", "volume", "surface"})]
 )
@@ -362,6 +371,7 @@ def test_memory_stays_flat_over_500_steps(capture, tmp_path, masks, passes):
     assert all(mb < 6 for mb in grown.values()), grown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [flash_photos, collection_photos], ids=lambda m: m.__name__)
 def test_kill_9_in_the_surface_pass_of_other_kinds(capsys, tmp_path, make):
     photos, flags = make(tmp_path / "photos")

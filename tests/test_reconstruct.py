@@ -65,6 +65,7 @@ def relit(capsys, *argv):
     return code, out.out, out.err
 
 
+@pytest.mark.slow
 def test_a_stopped_job_resumes_and_a_finished_one_is_left(capsys, tmp_path, capture):
     command = ("reconstruct", capture, "-o", tmp_path / "run", "--quality", "draft", "--seed", "3")
     STOP.append(KeyboardInterrupt())
@@ -139,6 +140,7 @@ def test_the_asset_says_how_it_was_made_and_holds_no_path(capsys, tmp_path, capt
     )
 
 
+@pytest.mark.slow
 def test_a_runs_config_repeats_it(capsys, tmp_path, capture):
     assert (
         relit(
@@ -186,6 +188,7 @@ def test_a_runs_config_repeats_it(capsys, tmp_path, capture):
     assert parse_toml((tmp_path / "c/config.toml").read_text())["seed"] == 8
 
 
+@pytest.mark.slow
 def test_other_settings_and_replaced_photos_are_refused(capsys, tmp_path, capture):
     run = tmp_path / "run"
     assert relit(capsys, "reconstruct", capture, "-o", run, "--quality", "draft")[0] == 0

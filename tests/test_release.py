@@ -59,6 +59,7 @@ def wheel(tmp_path_factory) -> Path:
     return next((copy / "dist").glob("relit-*.whl"))
 
 
+@pytest.mark.slow
 def test_the_wheel_works_in_an_environment_of_its_own(wheel):
     """Dependencies are those of the test's own environment; RELIT_WHEELS names a folder of wheels
     that they are installed from instead."""

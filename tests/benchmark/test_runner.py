@@ -156,6 +156,7 @@ def tiny(tmp_path, monkeypatch):
     return tmp_path, data
 
 
+@pytest.mark.slow
 def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
     folder, data = tiny
     commands = []
@@ -221,6 +222,7 @@ def test_the_command_is_the_one_a_user_would_give(tmp_path):
     assert command[command.index("--capture") + 1] == "multiview"
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_is_told_and_the_others_go_on(tiny, monkeypatch, capsys):
     """As `search` of the duplicates does, without which nothing is left to show: a result of the
     ablation, not the end of the suite."""

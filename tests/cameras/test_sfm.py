@@ -27,6 +27,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_textured_corner(folder, tmp_path):
     truth = arc()
     capture = open_capture(folder)
@@ -56,6 +57,7 @@ def test_a_textured_corner(folder, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_a_fixed_focal_stays_and_strangers_are_left_out_with_a_reason(
     folder, tmp_path, monkeypatch
 ):
@@ -86,6 +88,7 @@ def test_textureless_photos_are_refused_with_the_reason(tmp_path):
     assert caught.value.code == EXIT_FAILED and "4 have fewer than 150 features" in caught.value.why
 
 
+@pytest.mark.slow
 def test_four_photos_of_forty_are_no_capture(folder, tmp_path):
     room = tmp_path / "room"
     room.mkdir()

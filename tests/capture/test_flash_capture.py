@@ -33,6 +33,7 @@ def made(tmp_path_factory, device):
     )
 
 
+@pytest.mark.slow
 def test_reader_and_synthesizer_agree(made):
     capture = open_capture(made)
     truth = json.loads((made / "truth" / "truth.json").read_text())

@@ -314,6 +314,7 @@ KEYS = [
 ]
 
 
+@pytest.mark.slow
 @given(
     st.dictionaries(st.sampled_from(KEYS), values, max_size=4),
     st.dictionaries(

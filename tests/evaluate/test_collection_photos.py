@@ -103,6 +103,7 @@ def values(result):
     return {k: e["value"] for k, e in result["metrics"].items()}
 
 
+@pytest.mark.slow
 def test_photos_that_were_set_aside_are_compared_under_their_own_lights(
     asset, folder, tmp_path, capsys
 ):
@@ -181,6 +182,7 @@ def test_without_a_photo_set_aside_or_a_camera_there_is_no_figure(asset, folder,
         evaluate_on_collection(other, folder)
 
 
+@pytest.mark.slow
 def test_the_truth_of_a_synthetic_collection(tmp_path):
     """The asset that was photographed, with the true cameras and lights, in a frame of its own."""
     from relit.asset.gltf import read_asset_file, write_glb

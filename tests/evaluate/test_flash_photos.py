@@ -71,6 +71,7 @@ def figures(result):
     return {name: entry["value"] for name, entry in result["metrics"].items()}
 
 
+@pytest.mark.slow
 def test_the_asset_that_was_photographed(plastic, capture, tmp_path):
     save_asset(tmp_path / "asset", replace(plastic, cameras=plastic.cameras[:4]))
     result = evaluate(tmp_path, capture, spp=SPP)

@@ -100,6 +100,7 @@ def values(result):
     return {k: e["value"] for k, e in result["metrics"].items()}
 
 
+@pytest.mark.slow
 def test_the_asset_that_was_photographed(asset, masked, tmp_path):
     save_asset(tmp_path / "asset", asset)
     result = evaluate(tmp_path, masked, spp=SPP)

@@ -91,6 +91,7 @@ def value(result, name):
     return result["metrics"][name]["value"]
 
 
+@pytest.mark.slow
 def test_the_truth_against_itself(truth, itself):
     result = protocols.evaluate_asset(itself, truth, spp=SPP, seed=5)
     assert result["alignment"] == "identity"
@@ -105,6 +106,7 @@ def test_the_truth_against_itself(truth, itself):
     assert all(entry["definition"] for entry in result["metrics"].values())
 
 
+@pytest.mark.slow
 def test_an_albedo_of_another_scale_is_undone_by_the_scale_alone(truth, itself):
     factors = np.array([0.7, 0.8, 0.9], np.float32)
     wrong = replace(itself.material, base_color=itself.material.base_color * factors)
@@ -177,6 +179,7 @@ def test_what_can_be_seen_from_around_is_the_outer_surface(truth, itself):
     assert one[outer & facing].mean() > 0.97 and 0.25 < one[outer].mean() < 0.55
 
 
+@pytest.mark.slow
 def test_missing_surface_counts_as_an_error(truth, itself):
     half = itself.mesh.faces[itself.mesh.vertices[itself.mesh.faces].mean(1)[:, 1] > 0]
     asset = replace(

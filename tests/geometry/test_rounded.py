@@ -10,7 +10,7 @@ from relit.geometry.revolution_axis import Axis
 from relit.geometry.rounded import refine_axis, rounded
 from relit.geometry.sdf import node_positions, redistance
 
-N = 64
+N = 48
 STEP = 2 / (N - 1)
 AXIS = Axis(
     np.array([0.02, 0, -0.01]), np.array([0.1, 0.99, 0.05]) / np.linalg.norm([0.1, 0.99, 0.05])
@@ -42,6 +42,7 @@ def off(mesh, sides=0.5):
     return (radius - 0.35 - 0.06 * np.cos(4 * height))[side], angle[side]
 
 
+@pytest.mark.slow
 def test_ripples_go():
     mesh = lathe(lambda turn, height: 0.005 * np.sin(9 * turn + 7 * height))
     (before, slanted), (after, upright) = off(mesh), off(rounded(mesh, AXIS, STEP))
@@ -50,6 +51,7 @@ def test_ripples_go():
     assert np.median(upright) < 0.35 * np.median(slanted)
 
 
+@pytest.mark.slow
 def test_a_handle_stays():
     away = np.cross(AXIS.direction, [0, 0, 1.0])
     place = AXIS.point + 0.5 * away / np.linalg.norm(away)
@@ -57,9 +59,10 @@ def test_a_handle_stays():
     ball = np.linalg.norm(mesh.vertices - place, axis=1) < 0.21
     ball &= AXIS.radii(mesh.vertices) > 0.42 + 4 * STEP  # away from where it meets the body
     moved = np.linalg.norm(rounded(mesh, AXIS, STEP).vertices - mesh.vertices, axis=1)
-    assert ball.sum() > 200 and moved[ball].max() < 0.3 * STEP and np.median(moved[ball]) == 0
+    assert ball.sum() > 100 and moved[ball].max() < 0.3 * STEP and np.median(moved[ball]) == 0
 
 
+@pytest.mark.slow
 def test_a_window_stays():
     deep = 3 * STEP
 
@@ -77,12 +80,14 @@ def test_a_window_stays():
     ) == pytest.approx(0, abs=0.1 * STEP)
 
 
+@pytest.mark.slow
 def test_an_oval_stays():
     mesh = lathe(lambda turn, height: 0.1 * np.cos(2 * turn))
     before, after = off(mesh)[0], off(rounded(mesh, AXIS, STEP))[0]
     assert after.std() > 0.95 * before.std()
 
 
+@pytest.mark.slow
 def test_an_axis_that_is_off_is_found():
     lean = np.cross(AXIS.direction, [0, 0, 1.0]) * 0.02
     wrong = Axis(

@@ -28,6 +28,7 @@ EVEN = [
 LOPSIDED = [*EVEN[:2], *EVEN[3:], ((0.3, 0.5, 0.2), (-0.2, -0.4, -0.3))]
 
 
+@pytest.mark.slow
 def test_the_plane_is_found_wherever_the_body_lies():
     pose = similarity(exp_so3(np.array([0.4, -0.7, 1.1])), np.array([0.05, -0.1, 0.02]))
     plane, distance = symmetry_plane(move_points(pose, surface(EVEN)))

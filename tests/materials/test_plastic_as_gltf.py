@@ -39,6 +39,7 @@ def albedos(kd, base, ks, alpha, degrees):
     return [2 * np.pi * float(dr.mean(c.x)[0]) for c in (plastic, gltf)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0, 45])
 @pytest.mark.parametrize("alpha, tolerance", [(0.05, 0.06), (0.14, 0.06), (0.3, 0.06), (0.5, 0.08)])
 def test_both_are_as_bright_under_a_uniform_light(alpha, tolerance, degrees):

@@ -37,6 +37,7 @@ def ours(kd, ks, alpha, ior, v, l):
     return np.array(evaluate_plastic(m, Coat(ior), n, mi.Vector3f(v), mi.Vector3f(l)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ior", [1.33, 1.49, 1.7])
 @pytest.mark.parametrize("alpha", [0.05, 0.15, 0.4, 0.9])
 def test_agrees_with_mitsuba(alpha, ior):

@@ -211,6 +211,7 @@ def with_alpha(folder, light):
     return folder
 
 
+@pytest.mark.slow
 def test_light_is_checked_before_a_flash_reconstruction(tmp_path, monkeypatch):
     """The environment-lit set with alpha is refused before anything is computed, and goes on when
     asked to; a flash set goes on."""
@@ -347,6 +348,7 @@ def write(folder, n=24, turned=0.0, side=256):
     return folder
 
 
+@pytest.mark.slow
 def test_cameras_of_other_photos_give_a_warning(tmp_path):
     from relit.job import Job
 

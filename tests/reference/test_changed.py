@@ -38,6 +38,7 @@ def piles():
     return scenes, camera, instance_ids(scenes[0], both, camera)
 
 
+@pytest.mark.slow
 def test_a_change_is_the_same_as_of_whole_renders_and_most_of_the_photo_is_not_rendered(piles):
     (before, after), camera, ids = piles
     picture, own = shown(before, camera), ids == 1

@@ -144,6 +144,7 @@ def made(request):
     )
 
 
+@pytest.mark.slow
 def test_what_the_report_draws_is_what_the_photos_show(made, tmp_path, report_sizes):
     kind, asset, capture = made
     assert kind_of(asset) == kind

@@ -63,6 +63,7 @@ def capture(ball, tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_layout(capture):
     truth = json.loads((capture / "truth" / "truth.json").read_text())
     assert (
@@ -135,6 +136,7 @@ def test_the_same_settings_return_at_once_and_others_are_refused(ball, capture):
         )
 
 
+@pytest.mark.slow
 def test_a_stopped_rendering_is_taken_up_with_the_same_result(ball, capture):
     asset, light, other = ball
     lost, kept = capture / "train" / "r_002.png", capture / "train" / "r_001.png"

@@ -35,6 +35,7 @@ def material(kind: str, seed: int):
     return material_of(kind, rng, points, np.zeros((96, 96), int))
 
 
+@pytest.mark.slow
 def test_shapes_are_closed_and_differ_by_kind(objects):
     volume, area = {}, {}
     for kind, (mesh, _) in objects.items():
@@ -119,6 +120,7 @@ def test_names_of_objects(tmp_path, monkeypatch):
             object_spec(wrong)
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_a_seed_and_makes_the_same_object(tmp_path, monkeypatch, capsys):
     from relit.images import write_linear
 

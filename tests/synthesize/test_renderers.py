@@ -77,6 +77,7 @@ def test_principled_has_the_dielectrics_reflectance():
         principled_eta(constant(specular=np.array([[0.5, 1.0]], np.float32)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("material", "mean", "pixels"),
     # Burley's diffuse keeps what the coat reflects; a rough metal without compensation is darker
@@ -115,6 +116,7 @@ def test_ceiling_of_a_known_difference(tmp_path):
     assert found["psnr"] > found["psnr_masked"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["relit", "mitsuba"])
 def test_a_capture_has_its_ceiling(files, tmp_path, renderer):
     asset, light, other = files

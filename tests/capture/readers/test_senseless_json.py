@@ -128,6 +128,7 @@ def spoilt(value, rng):
     return value
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("layout", [mvmc, ners, samurai, coco, nerfstudio])
 def test_senseless_values(tmp_path, layout):

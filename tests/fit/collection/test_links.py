@@ -40,6 +40,7 @@ def arc(count, step=14.0):
     return np.stack([np.sin(a), 0.25 * np.cos(2 * a), np.cos(a)], 1)
 
 
+@pytest.mark.slow
 def test_photos_of_one_ball_are_linked_whatever_their_light(tmp_path):
     pytest.importorskip("pycolmap")
     from relit.cameras.links import link_photos
@@ -127,6 +128,7 @@ def test_a_group_outvotes_a_photo_that_stands_elsewhere():
     assert consensus(group, scattered) is None
 
 
+@pytest.mark.slow
 def test_a_cut_photo_is_found_with_place_and_scale_free():
     """The lower half of the picture is outside the frame: the whole silhouette's middle and size
     say nothing."""
@@ -207,6 +209,7 @@ def spoilt(shots, which):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", [None, 4])
 def test_one_bad_mask_does_not_unlink_few_photos(bad):
     from relit.cameras.links import Group
@@ -229,6 +232,7 @@ def test_one_bad_mask_does_not_unlink_few_photos(bad):
         assert f"without {bad}.png" in named[0] and scores.argmin() == bad
 
 
+@pytest.mark.slow
 def test_given_cameras_begin_the_shape_like_matches(monkeypatch):
     """They are not matched again, and bring every photo to its place; one photo without a camera,
     and matches are asked."""

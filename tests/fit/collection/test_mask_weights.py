@@ -66,6 +66,7 @@ def normal_error(mesh, lump) -> float:
     )
 
 
+@pytest.mark.slow
 def test_masks_that_are_heard_less_in_the_fine_level_leave_a_smoother_surface(photos, lump):
     loud, quiet = (normal_error(fitted(photos, mask=m), lump) for m in ((0.8,), (0.8, 0.1)))
     assert quiet < 0.9 * loud  # measured on four sets of photos: .850 to .865

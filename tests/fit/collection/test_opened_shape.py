@@ -54,6 +54,7 @@ def shape_of(inside, folder, options=OPTIONS):
     return dense_values(model.grid), shape.cameras
 
 
+@pytest.mark.slow
 def test_room_is_opened_once(small, tmp_path, monkeypatch):
     values, found = shape_of(BOX & ~ROOM, tmp_path / "run")
     shown = resample(values, N) < 0
@@ -69,6 +70,7 @@ def test_room_is_opened_once(small, tmp_path, monkeypatch):
     assert np.array_equal(kept, values)
 
 
+@pytest.mark.slow
 def test_solid_box_stays_as_it_was(small, tmp_path):
     values, found = shape_of(BOX, tmp_path / "run")
     assert np.array_equal(values < 0, BOX)

@@ -56,6 +56,7 @@ def capture(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_layout_and_truth(capture):
     from relit.asset.asset import read_cameras
     from relit.capture.open import open_capture
@@ -87,6 +88,7 @@ def test_masks_are_roughened_but_right(capture):
     assert np.abs(mask - np.clip(alpha, 0, 1)).max() > 0.2
 
 
+@pytest.mark.slow
 def test_from_the_command_line_to_the_figures(capture, tmp_path):
     from relit.asset.asset import load_asset
     from relit.cli.main import main
@@ -283,6 +285,7 @@ def test_three_photos_are_too_few(tmp_path):
     assert raised.value.code == 3
 
 
+@pytest.mark.slow
 def test_noise_is_no_object(tmp_path):
     """Photos that have nothing in common end in a verdict, not in an asset."""
     folder = photos(

@@ -64,6 +64,7 @@ def photographed():
     return asset, camera, view, np.linalg.inv(places[7])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 1.9, 3.14])
 def test_the_turn_that_looks_like_the_photo_is_found(photographed, angle):
     asset, camera, view, pose = photographed
@@ -79,6 +80,7 @@ def test_the_turn_that_looks_like_the_photo_is_found(photographed, angle):
     assert begun.instances[0].world_from_object is asset.instances[0].world_from_object
 
 
+@pytest.mark.slow
 def test_only_guessed_instances_are_turned_and_a_rerun_reads_them_back(
     photographed, tmp_path, monkeypatch
 ):
@@ -116,6 +118,7 @@ def test_what_shows_nothing_whole_stays_as_it_is(photographed):
     assert np.allclose(turned_as_shown(asset, [hidden], [camera], pose[None], AXIS)[0], pose)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, np.pi])
 def test_where_two_turns_look_alike_the_one_it_has_stays(photographed, angle):
     asset, camera, view, pose = photographed

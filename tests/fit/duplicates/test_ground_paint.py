@@ -52,6 +52,7 @@ def seen(device):
     return asset, pixels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [(0.5, 0.5, 0.5), (0.05, 0.3, 0.9)])
 def test_the_ground_is_as_bright_as_the_photo_shows_it(seen, start):
     asset, pixels = seen

@@ -127,6 +127,7 @@ def test_without_the_search_one_set_that_matches_hold_together_is_left():
     assert not poses_stage.linked_together(3, ()).any()
 
 
+@pytest.mark.slow
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile), unsure=90.0)
     capture = open_capture(pile)
@@ -184,6 +185,7 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
         assert told[name]["value"] == pytest.approx(metrics[name]["value"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_what_a_wrongly_placed_instance_shows_stands_out(pile, tmp_path):
     capture, options = open_capture(pile), small_options()
     shots = [(p.load(), p.camera.with_pose(np.eye(4))) for p in capture.photos]
@@ -297,6 +299,7 @@ def test_odd_instances_are_few_among_many():
     assert found([1, np.nan, 1.1, 1, 1, 0.9, 1, 1]) == []
 
 
+@pytest.mark.slow
 def test_odd_instances_are_left_out_and_said(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile))
     calls = []
@@ -492,6 +495,7 @@ def test_who_joins_is_sought_where_few_are_left_out(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_two_photos_of_one_pile(tmp_path, monkeypatch):
     write_glb(tmp_path / "pawn.glb", *pawn(rows=12, columns=16, texture=16))
     write_linear(tmp_path / "light.exr", np.full((8, 16, 3), 0.7, np.float32))
@@ -541,6 +545,7 @@ def test_two_photos_of_one_pile(tmp_path, monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_one_object_in_several_photos_runs_and_says_what_it_is(pile, tmp_path, monkeypatch):
     capture = open_capture(pile)
     photo = capture.photos[0]

@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from relit.fit.duplicates.options import DuplicatesOptions
 from relit.fit.duplicates.round_bodies import made_round
@@ -46,6 +47,7 @@ def asked(mesh, truth, **changes):
     ), said
 
 
+@pytest.mark.slow
 def test_bumps_go():
     truth, bumpy = egg(), egg(0.006)
     even, said = asked(bumpy, truth)
@@ -61,6 +63,7 @@ def test_bumps_go():
     assert len(said) == 1 and "body of revolution" in said[0]
 
 
+@pytest.mark.slow
 def test_an_oval_and_what_is_asked_to_stay_are_left():
     oval = egg(0.022, 2)  # its outlines would move by .8 of a pixel
     result, said = asked(oval, oval)

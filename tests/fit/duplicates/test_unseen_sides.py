@@ -108,6 +108,7 @@ def lowest(values):
     return float(node_positions(NODES)[..., 1][values < 0].min())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body, share, below", [(ball, 0.5, 0.35), (slab, 0.2, 0.15)])
 def test_what_hangs_below_goes_where_all_look_down(body, share, below):
     truth, hull, views, poses = scene_of(body, ABOVE)
@@ -119,6 +120,7 @@ def test_what_hangs_below_goes_where_all_look_down(body, share, below):
     assert abs(lowest(after) - lowest(truth)) < below < lowest(truth) - lowest(hull)
 
 
+@pytest.mark.slow
 def test_what_is_seen_stays_where_it_is():
     _, hull, views, poses = scene_of(ball, ABOVE)
     after, _ = closed_where_unseen(hull, views, poses)
@@ -128,6 +130,7 @@ def test_what_is_seen_stays_where_it_is():
     assert away.max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body, lost", [(ball, 0.01), (slab, 0.01), (two_legs, 0.02)])
 def test_every_ray_of_a_silhouette_still_meets_the_body(body, lost):
     _, hull, views, poses = scene_of(body, ABOVE)
@@ -175,6 +178,7 @@ def test_who_sees_what():
     assert 0.4 < areas[seen].sum() / areas.sum() < 0.75
 
 
+@pytest.mark.slow
 def test_share_of_the_sky():
     truth = redistance(ball(node_positions(NODES)).astype(np.float32))
     mesh = extract_mesh(truth)

@@ -127,6 +127,7 @@ def test_a_thin_tip_stays():
     assert ends[0].height > 0.65 and abs(ends[1].height - TOP) < 0.06
 
 
+@pytest.mark.slow
 def test_a_hollow_has_a_wall_and_a_floor():
     n = 96
     p, voxel = node_positions(n), 2 / 95
@@ -203,6 +204,7 @@ def asked(folder, profile, monkeypatch):
     return found, scale, (folder / "run" / "log.txt").read_text()
 
 
+@pytest.mark.slow
 def test_light_tells_a_cup_from_a_plug(tmp_path, monkeypatch):
     cup, scale, said = asked(tmp_path / "cup", CUP, monkeypatch)
     plug, same, silent = asked(tmp_path / "plug", PLUG, monkeypatch)

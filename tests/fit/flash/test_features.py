@@ -45,6 +45,7 @@ def places():
 FLASH = FlashLamp(np.array(scene.OFFSET), scene.INTENSITY)
 
 
+@pytest.mark.slow
 def test_albedo_from_photos_from_the_side(shot, places):
     bank, views, mesh, truth = shot
     x, n, uv = places

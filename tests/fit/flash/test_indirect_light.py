@@ -99,6 +99,7 @@ def scene(device):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounces", [1, 2])
 def test_against_the_path_tracer(scene, bounces):
     mesh, traceable, field, o, d = scene
@@ -189,6 +190,7 @@ def ambient(scene, photos):
     return find_ambient(*photos, scene[0], Coat(), FlashLamp(np.array(OFFSET), 6.0), max(DIFFUSE))
 
 
+@pytest.mark.slow
 def test_first_colours_do_not_hold_the_bowl_s_own_light(scene, photos, ambient):
     traceable = scene[1]
     bank, views = photos

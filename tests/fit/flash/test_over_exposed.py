@@ -86,6 +86,7 @@ def surface_after(shot, value, saturated):
     return np.array(model.field.diffuse), np.array(kin.level)
 
 
+@pytest.mark.slow
 def test_surface_pass(shot):
     """Neither the patches, which change the textures, nor the evidence of the groups see how far
     a pixel is over-exposed."""

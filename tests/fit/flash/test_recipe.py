@@ -150,6 +150,7 @@ def test_the_asset_stands_in_the_frame_of_the_cameras():
     assert np.ptp(placed[:, 1]) == pytest.approx(2 * 2 * 0.7, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_from_photos_to_figures(device, tmp_path):
     from relit.asset.gltf import write_glb
     from relit.capture.open import open_capture

@@ -54,6 +54,7 @@ def loss_of(shot, offset, log_intensity, field, bounces=0):
     return dr.sum(dr.select(points.valid, dr.sum(dr.square(value - 0.8 * batch.rgb)), 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_gradients(shot, name):
     field = scene.textures(16)
@@ -127,6 +128,7 @@ def found(shot):
     return fitted(shot)
 
 
+@pytest.mark.slow
 def test_offset_is_found_from_a_flash_at_the_camera(found):
     offset = np.array(found.offset)
     angle = np.degrees(np.linalg.norm(offset[:2] - scene.OFFSET[:2]) / 3.0)
@@ -146,6 +148,7 @@ def test_lobes_are_found_for_both_paints(shot, found):
         )
 
 
+@pytest.mark.slow
 def test_patches_lead_to_the_offset_too(shot):
     model = fitted(shot, patches=0.3, steps=60, kin=False)
     assert np.linalg.norm(np.array(model.offset)[:2] - scene.OFFSET[:2]) < 0.6 * np.linalg.norm(

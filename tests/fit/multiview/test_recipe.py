@@ -125,6 +125,7 @@ def test_a_ball_comes_back(capture_folder, tmp_path):
     assert 0.03 < second[24:40, 88:104].mean() < 1 and second[24:40, 152:168].std(-1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_what_no_photo_shows_is_painted_like_what_is_next_to_it(capture_folder, tmp_path):
     whole = open_capture(capture_folder)
     capture = replace(whole, photos=whole.photos[:5])  # from above
@@ -143,6 +144,7 @@ def test_what_no_photo_shows_is_painted_like_what_is_next_to_it(capture_folder, 
         assert inside.mean() > 0.999, "no colour that is not on it"
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_a_checkpoint(capture_folder, tmp_path, monkeypatch):
     """A stop in the second level, then the same call: the steps before the checkpoint are not done
     again, and the result is as good."""
@@ -172,6 +174,7 @@ def test_it_goes_on_from_a_checkpoint(capture_folder, tmp_path, monkeypatch):
     assert abs(np.linalg.norm(world, axis=1).mean() - RADIUS) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["volume", "surface"])
 def test_no_kernel_is_compiled_in_steady_state(capture_folder, tmp_path, monkeypatch, stage):
     """After the first steps every step launches kernels that were seen before, and always the same
@@ -244,6 +247,7 @@ NAMES = [
 NAMES += ["normal_map", "first_material"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("without", NAMES)
 def test_every_ablation_changes_the_result(capture_folder, tmp_path, monkeypatch, without):
     """Each named part really is a part: switched off, what it acts on is not reached, and the fit

@@ -56,6 +56,7 @@ def shaken_capture(photos, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_refinement_brings_cameras_and_shape_nearer_to_the_truth(shaken_capture, tmp_path):
     before_angle, before_distance = camera_errors(
         poses(shaken(cameras(), 1.0, 0.02)), poses(cameras())
@@ -93,6 +94,7 @@ def with_normals(photos, folder, signs):
     return folder
 
 
+@pytest.mark.slow
 def test_normal_priors_from_files_help_and_those_that_look_away_are_refused(photos, tmp_path):
     """The same photos, with true normals, none, normals with x the other way, and normals that look
     away from the camera."""

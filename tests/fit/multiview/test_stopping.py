@@ -79,6 +79,7 @@ def shape_error(asset) -> float:
     return distance_to_truth(move_points(asset.world_from_asset, asset.mesh.vertices))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_asset(capture, whole, tmp_path):
     again = load_asset(
         reconstruct(
@@ -95,6 +96,7 @@ def test_the_same_seed_gives_the_same_asset(capture, whole, tmp_path):
     assert shape_error(again) == pytest.approx(shape_error(whole), rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage, after", [("volume", 70), ("surface", 40)])
 def test_kill_9_and_the_same_command_again(capture, whole, tmp_path, stage, after):
     run = tmp_path / "run"

@@ -52,6 +52,7 @@ def photos(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_shape_is_found_without_masks(photos, tmp_path):
     capture = open_capture(photos, masks="none", sphere=Sphere(np.zeros(3), 0.75))
     assert capture.photos[0].load().mask is None
@@ -62,6 +63,7 @@ def test_a_shape_is_found_without_masks(photos, tmp_path):
     assert distance_to_truth(vertices) < 0.02
 
 
+@pytest.mark.slow
 def test_photos_of_one_side_leave_the_other_side_open(photos, tmp_path):
     capture = open_capture(photos, masks="none", sphere=Sphere(np.zeros(3), 0.75))
     upper = tuple(p for p in capture.photos if p.camera.centre[1] > -0.6)

@@ -171,6 +171,7 @@ def test_a_dull_start_is_taken_where_the_short_fit_is_better(tmp_path, monkeypat
     assert min(begun) > 0.55, begun
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normals, fits", [(False, 2), (True, 3)])
 def test_the_fit_that_tells_dull_paint_is_spared_where_nothing_asks_for_it(normals, fits):
     """It is made where texels have normals of their own."""

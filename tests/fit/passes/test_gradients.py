@@ -291,6 +291,7 @@ def difference(scene, name, direction, step):
     return (at(1) - at(-1)) / (2 * step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, where", [(name, where) for name, (scenes, _) in PARAMETERS.items() for where in scenes]
 )

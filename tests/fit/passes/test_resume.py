@@ -61,6 +61,7 @@ class Stopped(NoStage):
             raise Over
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "run",
     [*PASSES, multiview_volume, multiview_surface, field_of_everything],

@@ -66,6 +66,7 @@ def painted(device):
     return photos(plain=False)
 
 
+@pytest.mark.slow
 def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
     from relit.fit.registration.fine_detail import compare_detail, surface_of
 
@@ -93,6 +94,7 @@ def test_a_new_photo_is_held_against_the_others(painted):
     assert compare_detail(surface, pictures[:1], truth[:1], choices[1:], laid).moved == {}
 
 
+@pytest.mark.slow
 def test_a_plain_ball_tells_nothing(device):
     from relit.fit.registration.fine_detail import compare_detail, surface_of
 

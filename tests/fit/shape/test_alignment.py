@@ -101,6 +101,7 @@ def test_pictures_lie_on_each_other_where_all_is_right(seen):
     assert shift_quantile([]) == 0
 
 
+@pytest.mark.slow
 def test_a_pose_is_asked_back_by_the_pixels_that_it_is_off(seen):
     """The shift is what the projection by the true pose says, in size and in sign, and so in both
     places of a pair."""
@@ -160,6 +161,7 @@ def test_a_mesh_that_is_too_thin_is_told_by_parallax(seen):
     assert ((found.vertices - thin.vertices) * mesh.normals).sum(1).mean() > 0
 
 
+@pytest.mark.slow
 def test_exact_labels_are_believed_alone(seen):
     mesh, cameras, pictures, masks = seen
     wrong = astray(cameras, 1.0)
@@ -170,6 +172,7 @@ def test_exact_labels_are_believed_alone(seen):
     assert off is None and apart(poses, cameras, mesh) < 0.5
 
 
+@pytest.mark.slow
 def test_labels_that_mislead_are_outvoted_by_textures(seen):
     """Labels moved by three pixels, each its own way."""
     mesh, cameras, pictures, masks = seen
@@ -196,6 +199,7 @@ def test_without_texture_outlines_are_followed_alone(seen):
     assert off is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [1, 3])
 def test_where_textures_cease_to_tell_outlines_are_followed_alone(seen, monkeypatch, left):
     """After one look at them, or in the midst of the rounds, no pair shares enough."""
@@ -257,6 +261,7 @@ def test_places_count_by_their_structure(seen):
     assert shift_quantile([some]) == 1.0
 
 
+@pytest.mark.slow
 def test_a_shape_that_is_wrong_bends_until_textures_agree():
     """Of views from all around, with poses that are off too: labels alone do not mend it."""
     mesh = lump()

@@ -30,6 +30,7 @@ def found(inside, progress=None):
     return gone, said
 
 
+@pytest.mark.slow
 def test_hollow_under_a_lid_is_opened(monkeypatch):
     """Each face is asked for what lies under it once, but again after one was opened; the steps of
     all trials are counted."""
@@ -48,6 +49,7 @@ def test_hollow_under_a_lid_is_opened(monkeypatch):
     assert (gone < 0)[~ROOM].mean() < 0.01
 
 
+@pytest.mark.slow
 def test_solid_box_stays_whole():
     gone, said = found(BOX)
     assert gone is None and not said

@@ -117,6 +117,7 @@ def test_poses_follow_too():
     assert error(found) < 0.3 * error([c.world_from_camera for c in wrong])
 
 
+@pytest.mark.slow
 def test_places_follow_and_turns_stay(seen):
     """Every camera is moved, the first one turned too."""
     cameras, masks = seen

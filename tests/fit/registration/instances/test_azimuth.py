@@ -70,6 +70,7 @@ def test_a_pose_descends_to_where_the_view_shows_what_the_others_show(around):
     assert rotation_angle(descended_alike(others, hidden, off)[:3, :3].T @ poses[0][:3, :3]) < 1.2
 
 
+@pytest.mark.slow
 def test_a_mark_tells_half_a_turn_of_a_pattern_that_repeats(around):
     mesh, views, poses = around
     others = others_of(mesh, views[1:], poses[1:])
@@ -93,6 +94,7 @@ def test_outlines_put_an_axis_right_before_textures_are_asked(around, seed):
     )
 
 
+@pytest.mark.slow
 def test_a_descent_that_leaves_the_axis_is_not_believed(around, monkeypatch):
     mesh, views, poses = around
     others = others_of(mesh, views[1:], poses[1:])

@@ -32,12 +32,14 @@ def asked(views, poses, members):
     )
 
 
+@pytest.mark.slow
 def test_a_set_whose_members_lead_is_kept_whole(linked):
     views, poses = linked
     members, same = asked(views, poses, [0, 1, 2, 3, 4])
     assert members == [0, 1, 2, 3, 4] and same is poses
 
 
+@pytest.mark.slow
 def test_of_a_set_of_which_some_are_half_a_turn_off_the_first_link_is_left(linked):
     views, poses = linked
     wrong = poses.copy()

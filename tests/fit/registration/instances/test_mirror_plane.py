@@ -95,6 +95,7 @@ def found_plane(views, poses, seed=0):
     ).plane
 
 
+@pytest.mark.slow
 def test_a_few_views_tell_the_plane_and_not_where_shape_and_paint_are_lopsided():
     views, poses = views_of_body([-100, -30, 40, 110], even)
     plane = found_plane(views, poses)
@@ -108,6 +109,7 @@ def test_a_few_views_tell_the_plane_and_not_where_shape_and_paint_are_lopsided()
     assert other is None or abs(other.normal[0]) < 0.9
 
 
+@pytest.mark.slow
 def test_a_plane_must_lead_by_more_where_two_tell_it_and_the_last_one_is_believed_longer(
     monkeypatch,
 ):
@@ -149,6 +151,7 @@ def test_a_plane_must_lead_by_more_where_two_tell_it_and_the_last_one_is_believe
     assert kept == pytest.approx(plain + 0.03) and other == pytest.approx(plain)
 
 
+@pytest.mark.slow
 def test_a_body_is_bounded_by_its_mirror_image(monkeypatch):
     """Two views from one side leave the far side open; mirrored, the outlines bound it from there
     too: half as far off as the hull, and nearer than a taut body without a mirror."""

@@ -75,6 +75,7 @@ def errors(poses, true):
     return min((np.array([rotation_angle(m.T @ d) for d in e]) for m in e), key=np.median)
 
 
+@pytest.mark.slow
 def test_a_model_of_it_looks_most_like_itself_after_half_a_turn(pots):
     views, poses = pots
     best, *others = alike_turns(model_at(views, poses, SMALL, 0).gallery, 3)
@@ -120,6 +121,7 @@ def test_the_axis_of_the_turn_is_moved_to_where_silhouettes_fit(pots):
     assert np.abs(moved[[0, 2]]).max() < 0.015 and moved[1] == point[1]
 
 
+@pytest.mark.slow
 def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monkeypatch):
     monkeypatch.setattr(instance_turns, "ASKED", 1)
     monkeypatch.setattr(instance_turns, "SETTLED", 1)
@@ -143,6 +145,7 @@ def test_those_half_a_turn_off_are_turned_and_the_right_ones_are_left(pots, monk
     )
 
 
+@pytest.mark.slow
 def test_exact_poses_are_turned_and_do_not_move(pots, monkeypatch):
     monkeypatch.setattr(instance_turns, "ASKED", 1)
     views, poses = pots
@@ -189,6 +192,7 @@ def enlarged(view, times):
     }
 
 
+@pytest.mark.slow
 def test_an_object_that_looks_like_itself_all_the_way_is_left_alone():
     """Neither spout nor handle: either way is right."""
     views, poses = pot([BODY])
@@ -201,6 +205,7 @@ def test_an_object_that_looks_like_itself_all_the_way_is_left_alone():
     )
 
 
+@pytest.mark.slow
 def test_who_stands_up_to_such_turns_is_no_longer_unsure(pots, monkeypatch):
     """Those who were not sure are asked against a model of the others; one of them is astray."""
     views, poses = pots

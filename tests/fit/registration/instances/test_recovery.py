@@ -70,6 +70,7 @@ def lump():
     return model, views, np.array(poses)
 
 
+@pytest.mark.slow
 def test_it_is_found_though_half_of_it_is_hidden_and_it_stands_in_the_shade(lump, monkeypatch):
     model, (guide, hidden), poses = lump
     monkeypatch.setattr(module, "STEPS", 120)
@@ -181,6 +182,7 @@ def test_where_no_place_is_certain(lump, monkeypatch):
     assert seeds == [5]
 
 
+@pytest.mark.slow
 def test_of_one_whose_axis_is_known_all_turns_are_tried_and_the_best_is_taken(lump, monkeypatch):
     model, (guide, hidden), poses = lump
     monkeypatch.setattr(module, "STEPS", 60)

@@ -176,6 +176,7 @@ def test_bottles_are_placed_by_outlines_and_decoration_without_a_search(shots):
     assert any("azimuths about the axis are uncertain" in text for text in said) == unsure.any()
 
 
+@pytest.mark.slow
 def test_outlines_tell_the_axes(bottles):
     _, _, poses, body, seats = bottles
     assert body.misfit < EXACT
@@ -445,6 +446,7 @@ CUP = np.concatenate(
 )  # its profile
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4])
 def test_a_handle_tells_the_turns_front_and_back(seed):
     """Of axes that are right to a few degrees. Those who hide the handle, or show it before the
@@ -471,6 +473,7 @@ def test_without_a_handle_outlines_tell_no_turns(bottles):
     assert turned_by_outline(views, body.profile, body.poses) is None
 
 
+@pytest.mark.slow
 def test_axes_that_all_lean_the_wrong_way_come_back(bottles):
     """From afar all outlines together are the same so; perspective tells."""
     _, crops, _, body, _ = bottles

@@ -242,6 +242,7 @@ def test_those_stay_that_were_sure_that_agree_and_that_see_one_side():
     )  # all sure, and yet it does not agree
 
 
+@pytest.mark.slow
 def test_growing_again_ends_with_the_best_agreement(monkeypatch):
     """With growth that puts those right that join, as long as all that stay are; the judge is
     real."""
@@ -268,6 +269,7 @@ def test_growing_again_ends_with_the_best_agreement(monkeypatch):
     assert any("grown again" in text for text in said) and best.unsure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("firm", "sought"), [((0, 1, 2, 3), "all but the last two"), ((0, 1), "another pair")]
 )
@@ -478,6 +480,7 @@ def test_views_across_bound_what_one_leaves_open_in_depth():
     ).sum()
 
 
+@pytest.mark.slow
 def test_an_instance_joins_those_that_stand_and_poses_wait_for_the_shape():
     views, truth = painted([0, 20, 40])
     parts = (0.6, 2.0, 0.1)
@@ -502,6 +505,7 @@ def test_an_instance_joins_those_that_stand_and_poses_wait_for_the_shape():
     )
 
 
+@pytest.mark.slow
 def test_poses_are_found_from_silhouettes_and_colours_alone():
     views, truth = painted([0, 20, 40])
     small = {"nodes": 24, "steps": 16, "viewpoints": 200}
@@ -563,6 +567,7 @@ def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
     assert nearer(found[1], truth[1], wrong_pose) and not nearer(wrong_pose, truth[1], wrong_pose)
 
 
+@pytest.mark.slow
 def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
     """Which, and that it is kept, by real models; what growth does is tested above."""
     from relit.fit.registration.instances import rounds as instance_rounds
@@ -592,6 +597,7 @@ def test_two_in_wrong_places_are_taken_out_together(monkeypatch):
     assert np.allclose(found, truth, atol=1e-6) and scores.min() > 0.8
 
 
+@pytest.mark.slow
 def test_what_agrees_worse_when_it_is_grown_again_stays_where_it_was(monkeypatch):
     """Two stand in wrong places, and growth would put the others into wrong places as well. The
     judge is real."""
@@ -663,6 +669,7 @@ def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead(
     )
 
 
+@pytest.mark.slow
 def test_poses_of_a_ball_are_ambiguous_and_those_of_a_painted_body_are_not():
     o = Search(nodes=24, steps=12, viewpoints=300)
     views, truth = painted([0, 25, 50])

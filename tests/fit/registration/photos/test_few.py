@@ -33,6 +33,7 @@ def quiet(*_):
     """Says nothing."""
 
 
+@pytest.mark.slow
 def test_the_way_that_explains_the_photos_is_taken_unless_it_lost_some(photos, crops, monkeypatch):
     """Right poses have less misfit than wrong ones; ways that fail are passed over."""
     from relit.fit.registration.photos import few
@@ -76,6 +77,7 @@ def test_a_search_that_loses_photos_is_taken_back(monkeypatch, heights, ends):
     assert len(asked) == 3 and (poses == ends + 1).all() and (scores == heights[ends]).all()
 
 
+@pytest.mark.slow
 def test_few_photos_end_nearer_than_their_hints(photos, crops):
     from relit.fit.registration.photos.few import few_from_hints
     from relit.fit.registration.photos.poses import pose_towards, schedule_of

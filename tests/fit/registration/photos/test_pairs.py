@@ -188,6 +188,7 @@ def test_depth_is_bounded_while_all_look_from_one_side():
     assert depth_limit(crops, poses, 24) is None
 
 
+@pytest.mark.slow
 def test_solids_of_single_photos_find_their_neighbours():
     """Photos a few degrees apart find each other through the solid of one silhouette."""
     from relit.fit.registration.photos.growth import PARTS

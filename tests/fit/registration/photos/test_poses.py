@@ -58,6 +58,7 @@ def test_a_rough_start_descends(photos):
     assert model.grid.n == 32
 
 
+@pytest.mark.slow
 def test_only_the_lost_photo_moves(model, photos):
     from relit.fit.collection.held_out import look_again
     from relit.fit.collection.options import CollectionOptions
@@ -98,6 +99,7 @@ def test_ablation_without_search_keeps_the_hints(photos):
     assert (eyes * hints).sum(1).min() > 0.97 and (scores == 1).all()
 
 
+@pytest.mark.slow
 def test_agreement_tells_right_poses_from_wrong_ones(photos):
     from relit.fit.registration.photos.poses import cross_validated_share, even_colours
     from relit.fit.registration.register import crop_photo
@@ -110,6 +112,7 @@ def test_agreement_tells_right_poses_from_wrong_ones(photos):
     assert cross_validated_share(crops, wrong, 0, **coarse) <= 0.2
 
 
+@pytest.mark.slow
 def test_settling_searches_and_refines_and_never_ends_worse_than_it_began(photos):
     """The whole of it, twice: what is compared has as many parts everywhere, and poses whose mean
     score is higher than that of any round are what comes out."""
