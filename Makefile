@@ -18,12 +18,12 @@ environment:
 demo: setup
 	$(NICE) $(VENV)/bin/python -m relit demo -o runs/demo
 
-# all tests, side by side, one thread each; a worker that is done takes tests from another
-PYTEST = $(NICE) $(VENV)/bin/python -m pytest -q -n $(WORKERS) --dist worksteal
+# all tests; files of tests run side by side, one thread each
+PYTEST = $(NICE) $(VENV)/bin/python -m pytest -q -n $(WORKERS) --dist loadfile
 test: setup validator
 	$(PYTEST)
 
-# the tests without the marker `slow`: two minutes on two cores
+# the tests without the marker `slow`
 test-quick: environment
 	$(PYTEST) -m "not slow"
 
