@@ -20,7 +20,6 @@ from relit.fit.duplicates.mirrored_silhouettes import (
     find_symmetry,
     mirrored_rays,
     mirrored_views,
-    symmetry_from,
 )
 from relit.fit.duplicates.pose_passes import bounded_from_one_side
 from relit.fit.passes.optimiser import NoStage
@@ -32,6 +31,7 @@ from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
 from relit.geometry.se3 import exp_so3
 from relit.geometry.symmetry import Plane
+from relit.records import from_arrays, to_arrays
 from relit.reference.mitsuba_scene import build_geometry
 from relit.scene import Camera, Mesh
 
@@ -159,11 +159,9 @@ def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
     )
     round_one = body(((0.3, 0.5, 0.3), (0, 0, 0)))  # its mirror images show nothing new
     assert not bounded_from_one_side(round_one, Symmetry(ACROSS, round_one), None)
-    kept = symmetry_from({"poses": np.eye(4), **found.arrays})
-    assert np.array_equal(kept.plane.mirror, found.plane.mirror) and np.array_equal(
-        kept.mesh.faces, two.faces
-    )
-    assert build_geometry(kept.mesh) is not None and symmetry_from({"poses": np.eye(4)}) is None
+    kept = from_arrays(Symmetry, to_arrays(found))
+    assert np.array_equal(kept.plane.mirror, found.plane.mirror)
+    assert np.array_equal(kept.mesh.faces, two.faces) and build_geometry(kept.mesh) is not None
     crooked = body(
         ((0.3, 0.5, 0.4), (0, 0, 0)),
         ((0.4, 0.1, 0.1), (0.4, 0.4, 0)),
