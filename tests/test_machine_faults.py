@@ -149,6 +149,7 @@ def test_asked_to_stop(capture, tmp_path, number, code):
     assert "the same command" in log and "Traceback" not in log and not (run / "asset").exists()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_was_damaged(capsys, capture, finished, tmp_path):
     """Of the finished volume pass: the pass is done again, or the message says what to do."""
     run = tmp_path / "run"
@@ -170,6 +171,7 @@ def test_a_checkpoint_that_was_damaged(capsys, capture, finished, tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_what_a_finished_stage_has_kept_was_damaged(capsys, capture, finished, tmp_path):
     """Later stages were made from it: it cannot be made again behind their backs."""
     run = tmp_path / "run"
@@ -231,6 +233,7 @@ def test_two_runs_in_one_folder(capsys, capture, tmp_path):
     answered(code, err, 3, "another process works in this run folder")
 
 
+@pytest.mark.slow
 def test_a_run_folder_that_was_moved(capsys, capture, finished, tmp_path):
     moved, photos = tmp_path / "anderswo/Lauf", tmp_path / "andere Fotos" / capture.name
     shutil.copytree(finished, moved)

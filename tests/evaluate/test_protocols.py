@@ -118,6 +118,7 @@ def test_an_albedo_of_another_scale_is_undone_by_the_scale_alone(truth, itself):
     assert value(result, "environment_mse_scaled") < 1e-4 < value(result, "environment_mse")
 
 
+@pytest.mark.slow
 def test_a_recovered_frame_is_aligned_by_its_cameras(truth, itself):
     free = similarity(
         Rotation.from_euler("y", 90, degrees=True).as_matrix(), [1, 2, 3], 0.25
@@ -141,6 +142,7 @@ def test_a_recovered_frame_is_aligned_by_its_cameras(truth, itself):
     assert scale_of(back.world_from_asset) == pytest.approx(scale_of(itself.world_from_asset))
 
 
+@pytest.mark.slow
 def test_a_larger_object_has_the_known_chamfer_distance_and_hidden_parts_do_not_count(
     truth, itself
 ):
@@ -162,6 +164,7 @@ def test_a_larger_object_has_the_known_chamfer_distance_and_hidden_parts_do_not_
     )
 
 
+@pytest.mark.slow
 def test_what_can_be_seen_from_around_is_the_outer_surface(truth, itself):
     surface = metrics.sample_surface(itself.mesh.vertices, itself.mesh.faces, 5000)
     outer = (
@@ -207,6 +210,7 @@ def test_an_unfinished_or_missing_truth_is_a_user_error(tmp_path):
         load_truth(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_table_shows_every_figure(truth, itself):
     from io import StringIO
 

@@ -55,6 +55,7 @@ def test_shapes_are_closed_and_differ_by_kind(objects):
     assert thickness["bowl"] < thickness["blob"]
 
 
+@pytest.mark.slow
 def test_a_bowl_is_hollow_and_holds_things(objects):
     """From above, most of the opening shows a floor or contents below the rim."""
     mesh, _ = objects["bowl"]
@@ -84,6 +85,7 @@ def test_kinds_have_their_materials():
     assert gloss.metallic.max() == 0
 
 
+@pytest.mark.slow
 def test_texels_lie_on_the_surface(objects):
     """A texture of positions shows, through the renderer's look-up, the positions that are hit."""
     mesh, paint = objects["blob"]

@@ -60,6 +60,7 @@ def test_the_ground_is_as_bright_as_the_photo_shows_it(seen, start):
     assert ground_as_shown(begun, pixels).ground.colour == pytest.approx(TRUE, rel=0.02)
 
 
+@pytest.mark.slow
 def test_shadows_of_the_pile_are_not_taken_for_paint(seen):
     """The whole sky would make the ground darker than it is, by what the balls hide of it."""
     from relit.fit.duplicates.scene import ground_colour, ground_reflectance
@@ -71,6 +72,7 @@ def test_shadows_of_the_pile_are_not_taken_for_paint(seen):
     assert (whole < 0.9 * TRUE).all()
 
 
+@pytest.mark.slow
 def test_a_photo_without_ground_changes_nothing(seen):
     asset, pixels = seen
     everywhere = replace(pixels, labels=np.ones_like(pixels.labels))

@@ -162,6 +162,7 @@ def test_paint_that_hardly_gains_follows_the_rest_of_the_paint(other, taken):
     assert list(is_dull) == [taken, other == 0.8, False]
 
 
+@pytest.mark.slow
 def test_a_dull_start_is_taken_where_the_short_fit_is_better(tmp_path, monkeypatch):
     """What the decision says reaches the pass: everything that is called dull begins so."""
     monkeypatch.setattr(

@@ -80,6 +80,7 @@ def test_a_photo_from_the_wrong_side_is_told_by_what_is_painted(painted):
         assert np.allclose(camera.world_from_camera, truth[i].world_from_camera, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_new_photo_is_held_against_the_others(painted):
     from relit.fit.registration.fine_detail import compare_detail, photo_values_at, surface_of
 
@@ -104,6 +105,7 @@ def test_a_plain_ball_tells_nothing(device):
     assert len(told.moved) <= 1 and len(told.as_well) >= 6  # and so it is said
 
 
+@pytest.mark.slow
 def test_likeness_of_poses(painted):
     from relit.fit.registration.fine_detail import expected, likeness, photo_values_at, surface_of
 
@@ -127,6 +129,7 @@ def test_likeness_of_poses(painted):
     assert np.isnan(expected(laid[:3])).all()  # too few see anything
 
 
+@pytest.mark.slow
 def test_photos_in_wrong_places_are_not_borne_out(painted):
     from relit.fit.registration.fine_detail import detail_correlation, surface_of
 

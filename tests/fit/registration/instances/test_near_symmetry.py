@@ -114,6 +114,7 @@ def test_silhouettes_of_one_body_leave_the_smallest_gap(pots):
     assert blind.gap(none) == blind.gap(right) == 0
 
 
+@pytest.mark.slow
 def test_the_axis_of_the_turn_is_moved_to_where_silhouettes_fit(pots):
     views, poses = pots
     point = np.array([0.04, 0.3, -0.03])  # .05 from the object's axis

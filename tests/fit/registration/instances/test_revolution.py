@@ -191,6 +191,7 @@ def test_outlines_tell_the_axes(bottles):
     assert np.median([len(some) for some in seats]) <= 2
 
 
+@pytest.mark.slow
 def test_decoration_tells_the_turns_about_them(bottles, told):
     off = wrong_by(told.poses, bottles[2])
     assert (off < 12).sum() >= 5, off
@@ -201,6 +202,7 @@ def test_decoration_tells_the_turns_about_them(bottles, told):
     assert told.sure.sum() >= 4, told.sure
 
 
+@pytest.mark.slow
 def test_a_pose_that_is_off_comes_back_to_its_outline(bottles):
     _, crops, _, body, _ = bottles
     for crop, pose in zip(crops[:4], body.poses, strict=False):
@@ -217,6 +219,7 @@ def test_a_pose_that_is_off_comes_back_to_its_outline(bottles):
         )  # shortening by a tilt is nearly that by distance
 
 
+@pytest.mark.slow
 def test_an_axis_that_leans_the_other_way_has_nearly_the_same_outline(bottles):
     *_, body, _ = bottles
     turn = Rotation.random(random_state=4).as_matrix()
@@ -289,6 +292,7 @@ def test_what_a_shifted_map_gains_is_the_change_of_the_evidence(evidence, summed
         assert np.isclose(gain, weights @ more, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_turn_about_the_axis_leaves_the_axis(bottles):
     pose = bottles[3].poses[0]
     turned = turned_about(pose, 0.7)
@@ -297,6 +301,7 @@ def test_a_turn_about_the_axis_leaves_the_axis(bottles):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "short, long, told, asked",
     [
@@ -365,6 +370,7 @@ def test_bodies_of_revolution_keep_their_axes_and_are_searched_where_nothing_is_
     assert np.array_equal(found.poses, told.placed.poses) and bool(asked) == searched
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("right", [True, False])
 def test_turns_of_matches_and_of_axes_are_compared(shots, right):
     """Guessed turns do not replace matches that decoration bears out; wrong matches do not replace
@@ -468,6 +474,7 @@ def test_a_handle_tells_the_turns_front_and_back(seed):
     assert told.sure.sum() >= 5 and (off[told.sure] < 15).all(), (off, told.sure)
 
 
+@pytest.mark.slow
 def test_without_a_handle_outlines_tell_no_turns(bottles):
     views, *_, body, _ = bottles
     assert turned_by_outline(views, body.profile, body.poses) is None
