@@ -40,6 +40,7 @@ def run(tmp_path_factory):
     return save_asset(folder / "asset", asset), folder / "photo.png"
 
 
+@pytest.mark.slow
 def test_the_photo_changes_only_where_the_object_and_what_it_lights_are(run, tmp_path):
     folder, photo = run
     edit(folder, tmp_path / "red", photo=photo, base_color=(0.8, 0.05, 0.05), spp=16)

@@ -103,6 +103,7 @@ def wrong(path: Path, text: str | None = None) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", modules(), ids=lambda p: p.relative_to(SOURCE).as_posix())
 def test_direction(path):
     part = part_of(names_of(path))

@@ -62,6 +62,7 @@ def halves(path):
     return p[: h // 2].sum(), p[h // 2 :].sum(), p[:, : w // 2].sum(), p[:, w // 2 :].sum()
 
 
+@pytest.mark.slow
 def test_a_light_stands_upright_over_the_object(run, from_above, tmp_path):
     """The top of the map is over the asset's up, whatever the frame of the cameras."""
     files = relight(run, from_above, tmp_path / "out", spp=8)

@@ -107,6 +107,7 @@ def test_mitsuba_scene_renders_like_the_asset(folder, asset, tmp_path, load_scen
     assert np.abs(a.mean(0) - b.mean(0)).max() < 0.01
 
 
+@pytest.mark.slow
 def test_mitsuba_scene_of_a_rough_plastic_renders_like_the_asset(asset, tmp_path, load_scene):
     from relit.reference.flash_scene import build_flash_scene, render_flash
 

@@ -55,6 +55,7 @@ def test_broken_files_get_an_answer(tmp_path, obj, mtl):
         read_asset_file(tmp_path / "a.obj")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

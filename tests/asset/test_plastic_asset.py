@@ -39,6 +39,7 @@ def plastic(asset):
     )
 
 
+@pytest.mark.slow
 def test_the_folder_keeps_the_diffuse_albedo(tmp_path, plastic):
     folder = save_asset(tmp_path / "asset", plastic)
     assert (

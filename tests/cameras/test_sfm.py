@@ -105,6 +105,7 @@ def test_four_photos_of_forty_are_no_capture(folder, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_photos_that_look_apart_are_told_so_without_advice_about_given_poses(tmp_path):
     for i, x in enumerate(
         np.linspace(-0.5, 1.0, 5)

@@ -120,6 +120,7 @@ def test_the_asset_that_was_photographed(asset, masked, tmp_path):
     assert values(dark)["held_out_psnr_masked"] < 20
 
 
+@pytest.mark.slow
 def test_photos_without_masks_are_compared_over_the_object_sphere(asset, unmasked, tmp_path):
     config = tmp_path / "config.toml"
     config.write_text('masks = "none"\nsphere = [0.0, 0.0, 0.0, 1.2]\n')  # as the run was asked for
@@ -159,6 +160,7 @@ def test_a_frame_of_its_own_is_aligned(asset, masked):
     assert values(result)["camera_rotation"] < 1e-3
 
 
+@pytest.mark.slow
 def test_without_photos_set_aside_those_of_the_fit_are_named_so(asset, tmp_path):
     folder = write_capture(tmp_path, replace(asset, cameras=asset.cameras[:4]), True, held_out=0)
     got = values(photos.evaluate_on_photos(asset, folder, spp=64))

@@ -80,6 +80,7 @@ def test_of_chosen_pixels_alone(piles):
     )  # but for noise
 
 
+@pytest.mark.slow
 def test_pixels_that_the_new_thing_shares_are_rendered_both_ways(piles):
     (after, before), camera, ids = piles  # one object is put in
     picture, edge = shown(before, camera), np.zeros(ids.shape, bool)

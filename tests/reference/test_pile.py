@@ -103,6 +103,7 @@ def test_the_light_stands_with_the_camera():
     assert np.allclose(colour[:, 0], colour[:, 1], rtol=1e-4) and np.ptp(colour[:, 0]) > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", [40, MAP + 4, MAP + 20, SHADE, SHADE + 2, SHADE + 6])
 def test_gradient_of_what_is_learnt(entry):
     m, batch, cameras = rays()

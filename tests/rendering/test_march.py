@@ -66,6 +66,7 @@ def run(grid, o, d, t0, t1, inv_s, dt):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sharpness, step", [(1.0, 0.9), (4.0, 0.3)])
 @pytest.mark.parametrize("band", [np.inf, 3.0])
 def test_forward_agrees_with_the_twin(sharpness, step, band):

@@ -73,6 +73,7 @@ def estimate(mesh, points, field, environment, count, seed):
     return reflected(points, lights, surface, environment)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rough, metal", [(0.6, 0.0), (0.3, 1.0)])
 def test_radiance_agrees_with_the_reference_renderer(rough, metal):
     cam, mesh = camera(), ball()

@@ -160,6 +160,7 @@ def test_turntable_hands_over_masks_and_cameras_when_asked(turntable):
         assert photo.camera.world_from_camera == pytest.approx(pose)
 
 
+@pytest.mark.slow
 def test_multiview_through_a_phone_opens_undistorted_and_upright(files, tmp_path):
     model = CameraModel(distortion=0.1, turned=0.9, jpeg=95, exif=True)
     out = synthesize_multiview(

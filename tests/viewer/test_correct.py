@@ -31,6 +31,7 @@ def disc(x, y, r, side=48):
     return ((u - x) ** 2 + (v - y) ** 2 < r * r).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_a_corrected_mask_wins(capture):
     before = open_capture(capture)
     digest = input_digests(before)

@@ -93,6 +93,7 @@ def test_it_draws_what_mitsuba_draws(traced, reference):
     assert np.abs(picture[..., 3] - reference[..., 3]).mean() < 0.005
 
 
+@pytest.mark.slow
 def test_a_mirrored_light_would_be_seen(asset, reference):
     """The test above proves nothing if this fails."""
     scene = build_scene(

@@ -153,6 +153,7 @@ def test_data_that_would_end_the_script(built):
     assert SLOT not in text
 
 
+@pytest.mark.slow
 def test_names_in_the_index_cannot_leave_the_folder(run_folder, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(run_folder, run)

@@ -13,6 +13,7 @@ def real(shared, name):
     return folder
 
 
+@pytest.mark.slow
 def test_fox(shared):
     capture = open_capture(real(shared, "multiview_fox"), max_side=240)
     assert (len(capture.photos), len(capture.held_out), capture.format) == (50, 17, "transforms")

@@ -90,6 +90,7 @@ def turned(poses, rng, scale=3.0):
     return out, r
 
 
+@pytest.mark.slow
 def test_a_group_is_put_into_the_hints_frame():
     from relit.cameras.links import Group
     from relit.fit.collection.links import poses_of_group

@@ -37,6 +37,7 @@ from relit.synthesize.procedural import pawn
 from support.pile_of_pawns import SIZES, small_options, true_poses
 
 
+@pytest.mark.slow
 def test_a_pile_is_synthesized_once_and_never_with_other_settings(pile):
     folder = pile.parent
     files = folder / "pawn.glb", folder / "light.exr", pile

@@ -149,6 +149,7 @@ def test_nothing_changes_where_views_look_from_all_around():
     assert after is hull
 
 
+@pytest.mark.slow
 def test_what_is_too_thin_for_the_coarse_grid_stays():
     _, _, views, poses = scene_of(ball, ABOVE)
     y = node_positions(193)[..., 1]

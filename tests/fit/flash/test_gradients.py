@@ -140,6 +140,7 @@ class FlashPhotos:
         return display_loss(colour, self.batch.rgb, self.counts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, step", [("offset", 1e-3), ("distances", 1e-4), ("features", 2e-3), ("alpha", 1e-3)]
 )

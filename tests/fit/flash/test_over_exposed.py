@@ -51,6 +51,7 @@ def volume_after(bank, value, saturated):
     return np.array(model.grid.row_values), np.array(model.grid.features)
 
 
+@pytest.mark.slow
 def test_volume_pass(shot):
     bank = shot[0]
     a, b = volume_after(bank, 1.0, 0.99), volume_after(bank, 3.0, 0.99)

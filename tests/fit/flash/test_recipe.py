@@ -128,6 +128,7 @@ def test_the_flash_is_held_until_the_shape_stands(device):
     assert (early[:3] == 0).all() and (late[:3] > 0).all() and (early[3:] == late[3:]).all()
 
 
+@pytest.mark.slow
 def test_the_asset_stands_in_the_frame_of_the_cameras():
     """A sphere of radius 2 around (1, 0, 0): lengths double, intensity goes with their square, the
     product with the albedo stays."""

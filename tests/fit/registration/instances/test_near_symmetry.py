@@ -98,6 +98,7 @@ def test_of_turns_that_are_nearly_the_same_or_undo_one_another_the_best_is_kept(
     assert [value for value, _ in distinct_rotations(tried, 2)] == [0.5, 0.4]
 
 
+@pytest.mark.slow
 def test_silhouettes_of_one_body_leave_the_smallest_gap(pots):
     views, poses = pots
     found = Silhouettes(views, turned(poses, WRONG), motions_about(ABOUT_Y, np.zeros(3)))

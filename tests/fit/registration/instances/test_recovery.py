@@ -153,6 +153,7 @@ def test_places_count_whose_silhouettes_agree_about_as_well_as_the_best(lump):
     assert not np.isfinite(module.where_outlines_agree(errors[3:], guide, shifted[3:], model)).any()
 
 
+@pytest.mark.slow
 def test_where_no_place_is_certain(lump, monkeypatch):
     """Other places are tried with other seeds; of a body of revolution the best place whose
     silhouette agrees is turned to what the others show."""

@@ -535,6 +535,7 @@ def test_poses_are_found_from_silhouettes_and_colours_alone():
     assert alone.poses.shape == (1, 4, 4) and alone.scores.tolist() == [1.0] and alone.sure
 
 
+@pytest.mark.slow
 def test_an_instance_in_a_wrong_place_is_put_right_by_a_model_of_the_others():
     views, truth = painted([0, 20, 40, 60])
     parts = (0.6, 2.0, 0.1)

@@ -43,6 +43,7 @@ def after_alignment(poses, photos):
     return camera_errors(poses, np.array([c.world_from_camera for *_, c in photos]))[0]
 
 
+@pytest.mark.slow
 def test_a_rough_start_descends(photos):
     from relit.fit.registration.photos.poses import even_colours, fit_with_free_poses
     from relit.fit.registration.register import crop_photo
