@@ -357,12 +357,10 @@ for name in {n for n, _ in seen}:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "masks, passes", [("auto", {"volume", "surface"}), ("none", {"explore", "volume", "surface"})]
-)
-def test_memory_stays_flat_over_500_steps(capture, tmp_path, masks, passes):
-    """Of every pass: what a step allocates it gives back."""
-    command = [sys.executable, "-c", FLAT, str(capture), str(tmp_path / "run"), masks]
+def test_memory_stays_flat_over_500_steps(capture, tmp_path):
+    """Of every pass: what a step allocates it gives back. Passes with masks:
+    fit/passes/test_memory.py."""
+    command = [sys.executable, "-c", FLAT, str(capture), str(tmp_path / "run"), "none"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     grown = {
@@ -370,7 +368,7 @@ def test_memory_stays_flat_over_500_steps(capture, tmp_path, masks, passes):
         for line in done.stdout.splitlines()
         if len(line.split()) == 2
     }
-    assert passes <= set(grown), done.stdout
+    assert {"explore", "volume", "surface"} <= set(grown), done.stdout
     assert all(mb < 6 for mb in grown.values()), grown
 
 
