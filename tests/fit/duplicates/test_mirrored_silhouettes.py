@@ -137,6 +137,7 @@ def test_what_one_side_alone_has_is_left_out():
     assert mirrored_rays(Symmetry(ACROSS, both), bank, nothing) is None
 
 
+@pytest.mark.slow
 def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
     two = body(
         ((0.3, 0.5, 0.4), (0, 0, 0)),
@@ -174,6 +175,7 @@ def test_an_even_mesh_has_its_plane_and_a_lopsided_one_none():
     )  # what mirrored views show is seen already
 
 
+@pytest.mark.slow
 def test_views_from_one_side_bound_the_other_one_too():
     mesh = body(((0.35, 0.5, 0.5), (0, 0, 0)))
     views, poses = views_of_mesh(mesh, [20, 60, 110])
