@@ -70,6 +70,23 @@ def test_a_removed_instance_leaves_ground_without_its_shadow(run, tmp_path):
         edit(folder, tmp_path / "none", remove=[10, 20])
 
 
+def test_an_instance_that_only_a_further_photo_shows_can_be_removed(run, tmp_path):
+    """It is in the scene like any other; where the first photo has its label, that one is meant."""
+    folder, photo = run
+    asset = load_asset(folder)
+    near, far = asset.instances
+    save_asset(tmp_path / "asset", replace(asset, instances=(near, replace(far, photo=1))))
+    edit(tmp_path / "asset", tmp_path / "one", photo=photo, remove=[20], spp=32)
+    after, camera = read_image(tmp_path / "one" / "photo.png").rgb, asset.cameras[0][1]
+    u, v, _ = camera.project(np.array([1.0, 0.6, 0.0])).astype(int)
+    assert np.ptp(after[v - 2 : v + 3, u - 2 : u + 3].reshape(-1, 3).mean(0)) < 0.06
+    assert [i.label for i in load_asset(tmp_path / "one").instances] == [10]
+    twins = (near, replace(far, label=10, photo=1))
+    save_asset(tmp_path / "twins", replace(asset, instances=twins))
+    edit(tmp_path / "twins", tmp_path / "left", remove=[10])
+    assert [i.photo for i in load_asset(tmp_path / "left").instances] == [1]
+
+
 @pytest.mark.parametrize("labels", [False, True])
 def test_no_rim_of_a_removed_instance_stays_where_the_model_is_too_small(run, tmp_path, labels):
     folder, photo = run

@@ -29,6 +29,7 @@ from relit.reference.photographed import as_photographed
 from relit.reference.pile import build_pile, instance_ids, joined
 from relit.scene import Asset, Camera, Material, Mesh
 
+BEYOND_LABELS = 1 << 24  # labels have at most 24 bits of colour
 RIM = 0.004  # of the photo's longer side: as much around what is removed is rendered too
 
 
@@ -56,14 +57,8 @@ def edit(
     """
     out, asset = Path(out), load_asset(run)
     _in_range({"roughness": roughness, "metallic": metallic})
-    known = {i.label for i in asset.instances if i.registered and i.photo == 0}
-    for label in remove:
-        if label not in known:
-            raise UserError(
-                f"no registered instance has the label {label}",
-                f"labels: {', '.join(map(str, sorted(known)))}",
-                code=EXIT_USAGE,
-            )
+    numbers = instance_numbers(asset)
+    gone_numbers = removed_numbers(asset, numbers, remove)
     material = before = asset.material
     if base_color is not None:
         material = replace(
@@ -80,7 +75,7 @@ def edit(
             material = replace(material, **{name: np.full_like(getattr(material, name), value)})
     if before.diffuse is not None:
         material = as_plastic(material, before, tint, base_color is not None, roughness is not None)
-    kept = tuple(i for i in asset.instances if i.photo or i.label not in remove)
+    kept = tuple(i for i, n in zip(asset.instances, numbers, strict=True) if n not in gone_numbers)
     if asset.instances and not any(i.registered for i in kept):
         raise UserError("nothing would be left", fix="keep at least one instance", code=EXIT_USAGE)
     changed = replace(asset, material=material, instances=kept)
@@ -89,15 +84,11 @@ def edit(
         name, camera, picture = _photo(asset, photo)
         ids, new_ids = _ids(asset, camera), _ids(changed, camera)
         same = material is asset.material
-        shown, told = (
-            np.array([i.label for i in asset.instances if i.registered and i.photo == 0] + [0])[
-                ids
-            ],
-            _labels_beside(photo, ids.shape),
-        )
+        drawn = [n for i, n in zip(asset.instances, numbers, strict=True) if i.registered]
+        shown, told = np.array([*drawn, 0])[ids], _labels_beside(photo, ids.shape)
         if told is not None and name != asset.cameras[0][0]:
             told = as_shown(told, shown)
-        gone = cleared(shown, told, remove)
+        gone = cleared(shown, told, gone_numbers)
         own = gone if same else gone | (new_ids >= 0)
         shows = [partial(as_photographed(a), name, spp=spp, seed=seed) for a in (asset, changed)]
         after, change = change_of(*shows, camera, picture, own, progress=progress)  # pyright: ignore[reportCallIssue]
@@ -106,6 +97,29 @@ def edit(
         )
         written.append(out / "photo.png")
     return written
+
+
+def instance_numbers(asset: Asset) -> list[int]:
+    """A number for each instance: its label where it is the first photo's, else one that no label
+    has."""
+    return [i.label if i.photo == 0 else BEYOND_LABELS + k for k, i in enumerate(asset.instances)]
+
+
+def removed_numbers(asset: Asset, numbers: Sequence[int], remove: Sequence[int]) -> list[int]:
+    """The numbers of the registered instances with the labels `remove`; a label is the first
+    photo's where that has it. Raises UserError for a label that none has."""
+    known: dict[int, int] = {}
+    for i, number in sorted(zip(asset.instances, numbers, strict=True), key=lambda p: p[0].photo):
+        if i.registered:
+            known.setdefault(i.label, number)
+    for label in remove:
+        if label not in known:
+            raise UserError(
+                f"no registered instance has the label {label}",
+                f"labels: {', '.join(map(str, sorted(known)))}",
+                code=EXIT_USAGE,
+            )
+    return [known[label] for label in remove]
 
 
 def as_plastic(
@@ -202,7 +216,7 @@ def insert(
             code=EXIT_USAGE,
         )
     placed = mesh_on_ground(mesh, asset, camera, at, size, turn)
-    poses = [i.world_from_object for i in asset.instances if i.registered and i.photo == 0]
+    poses = [i.world_from_object for i in asset.instances if i.registered]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)  # pyright: ignore[reportArgumentType]
     before = build_scene(pile.mesh, pile.material, np.eye(4), asset.environment)
     whole, materials = joined(pile.mesh, pile.material, placed, material)
@@ -277,7 +291,7 @@ def coverage(scene, first_face: int, camera: Camera, samples: int = 16) -> np.nd
 
 def _ids(asset: Asset, camera: Camera) -> np.ndarray:
     """(H, W) which registered instance each pixel shows, -1 for none."""
-    poses = [i.world_from_object for i in asset.instances if i.registered and i.photo == 0] or [
+    poses = [i.world_from_object for i in asset.instances if i.registered] or [
         asset.world_from_asset
     ]
     pile = build_pile(asset.mesh, asset.material, poses, asset.ground)  # pyright: ignore[reportArgumentType]

@@ -214,6 +214,7 @@ class Run:
             with self.stage(name, steps=steps, title=title) as stage:
                 arrays = to_arrays(compute(stage))
                 stage.save("result", **arrays)
+            (stage.folder / "checkpoint.npz").unlink(missing_ok=True)  # the result holds it all
             return from_arrays(kind, arrays)  # as a resumed run reads it
         try:
             return from_arrays(kind, run_arrays(self, name, "result"))

@@ -7,8 +7,8 @@ with one node for each of them.
      "roughness": .8}}
 
 An instance that the first photo does not show has the number of the photo whose label it is,
-`"photo": 2`. A registered instance has a reason where its pose is uncertain. The object frame is the asset frame
-(the GLB's coordinates after its node transforms), the world that of `cameras.json`.
+`"photo": 2`. A registered instance has a reason where its pose is uncertain. The object frame is
+the asset frame (the GLB's coordinates after its node transforms), the world that of `cameras.json`.
 """
 
 from __future__ import annotations

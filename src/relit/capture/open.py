@@ -38,8 +38,8 @@ from relit.masks.segment import segmenter
 from relit.masks.threshold import Backdrop, find_backdrop
 from relit.scene import Capture, Photo, Sphere
 
-# In this order; the first that recognises the folder reads it. A reader has LOOKED_FOR, recognise(path)
-# and read(path, found) -> Reading; that of labelled photos gives its Source.
+# In this order; the first that recognises the folder reads it. A reader has LOOKED_FOR,
+# recognise(path) and read(path, found) -> Reading; that of labelled photos gives its Source.
 READERS = {
     "duplicates": sfd,
     "transforms": transforms_json,

@@ -133,6 +133,17 @@ def device_flag(parser: Parser) -> None:
     parser.common.add_argument("-d", "--device", choices=DEVICES, default="auto", help=text)
 
 
+def relight_flag(parser: Parser) -> None:
+    parser.common.add_argument(
+        "--relight",
+        type=Path,
+        nargs="*",
+        default=[],
+        metavar="FILE",
+        help="lights of the relighting ground truth",
+    )
+
+
 def overwrite_flag(parser: Parser, text: str = "replace existing output") -> None:
     parser.more.add_argument("-f", "--overwrite", action="store_true", help=text)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from relit.cli.parser import Kind, Parser
+from relit.cli.parser import Kind, Parser, relight_flag
 
 
 def delivery_flags(parser: Parser) -> None:
@@ -58,14 +58,7 @@ def _staged_flags(parser: Parser, views: int, camera: str) -> None:
     """Flags of everyday and turntable."""
     add, more = parser.common.add_argument, parser.more.add_argument
     add("--light", required=True, type=Path, metavar="FILE", help="light: lat-long .hdr or .exr")
-    add(
-        "--relight",
-        type=Path,
-        nargs="*",
-        default=[],
-        metavar="FILE",
-        help="lights of the relighting ground truth",
-    )
+    relight_flag(parser)
     add("--views", type=int, default=views, help=f"photos (default {views})")
     add("--test-views", type=int, default=8, help="test views of the object alone (default 8)")
     more("--resolution", type=int, default=400, help="pixels of the longer side (default 400)")

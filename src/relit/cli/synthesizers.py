@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from relit.cli.parser import Kind, Parser, device_flag, out_flag
+from relit.cli.parser import Kind, Parser, device_flag, out_flag, relight_flag
 from relit.cli.photographed import PHOTOGRAPHED, delivery_flags, delivery_of
 from relit.errors import EXIT_USAGE, UserError
 
@@ -79,14 +79,7 @@ def multiview_flags(parser: Parser) -> None:
         metavar="FILE",
         help="light: lat-long .hdr or .exr",
     )
-    add(
-        "--relight",
-        type=Path,
-        nargs="*",
-        default=[],
-        metavar="FILE",
-        help="lights of the relighting ground truth",
-    )
+    relight_flag(parser)
     add(
         "--renderer",
         choices=RENDERERS,
@@ -241,14 +234,7 @@ def duplicates_flags(parser: Parser) -> None:
         metavar="FILE",
         help="light: lat-long .hdr or .exr",
     )
-    add(
-        "--relight",
-        type=Path,
-        nargs="*",
-        default=[],
-        metavar="FILE",
-        help="lights of the relighting ground truth",
-    )
+    relight_flag(parser)
     add("--count", type=int, default=10, help="objects in the photo (default 10)")
     add("--photos", type=int, default=1, help="photos of the pile (default 1)")
     add("--test-views", type=int, default=8, help="novel views of the pile (default 8)")

@@ -107,12 +107,13 @@ class PileViews:
 
 
 def registered_poses(asset: Asset) -> dict[int, np.ndarray]:
-    """label -> world_from_object (4, 4) of the first photo's registered instances."""
-    return {
-        i.label: np.asarray(i.world_from_object)
-        for i in asset.instances
-        if i.registered and i.photo == 0
-    }
+    """label -> world_from_object (4, 4) of the registered instances. The labels of the photos of a
+    synthetic pile agree; where one stands twice, the first photo's counts."""
+    out: dict[int, np.ndarray] = {}
+    for i in sorted(asset.instances, key=lambda one: one.photo):
+        if i.registered:
+            out.setdefault(i.label, np.asarray(i.world_from_object))
+    return out
 
 
 def scaled_ground(g: Ground, centre: np.ndarray, scale: float) -> Ground:

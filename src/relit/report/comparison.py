@@ -113,7 +113,7 @@ def registered_pixels(
     and something is drawn."""
     labels = pixels.labels if pixels.labels is not None else np.ones(pixels.rgb.shape[:2], np.int32)
     registered = [i.label for i in asset.instances if i.registered and i.photo == 0]
-    count = f"{len(registered)} of {len(asset.instances)} objects"
+    count = f"{sum(i.registered for i in asset.instances)} of {len(asset.instances)} objects"
     if first and pixels.labels is not None:
         own = np.isin(labels, registered)
         return resized(

@@ -157,8 +157,7 @@ def synthesize_multiview(
         for i in np.unique(np.linspace(0, views - 1, min(SCALE_VIEWS, views)).round().astype(int))
     ]
     plan = _TrainingPlan(train, shots, delivery, scale_names)
-    sampling = _Sampling(spp, test_spp, max_depth, seed, say)
-    _write_training_photos(out, scene, environment, plan, sampling)
+    _write_training_photos(out, scene, environment, plan, _Sampling(spp, max_depth, seed, say))
     for i, (name, camera) in enumerate(test):
         write_test_view(
             out, scene, name, camera, test_spp, max_depth, seed * 1_000_003 + 500_000 + i
@@ -199,11 +198,9 @@ def synthesize_multiview(
 
 @dataclass(frozen=True)
 class _Sampling:
-    """Samples a pixel of training photos and of what is measured against, the longest path, the
-    seed, and who hears of the progress."""
+    """spp: samples a pixel of training photos. max_depth: longest path in edges. say: called with lines of progress."""
 
     spp: int
-    test_spp: int
     max_depth: int
     seed: int
     say: Callable[[str], None]

@@ -113,7 +113,7 @@ def test_a_result_that_all_evidence_contradicts_is_refused(photos, tmp_path):
     with Run.open(tmp_path / "run", {}) as run:
         check_borne_out(shots, right, 0.3, 0.1, run)
         check_borne_out(shots, wrong, 0.9, 0.1, run)
-        with pytest.raises(UserError, match="do not bear out") as raised:
+        with pytest.raises(UserError, match="contradict the camera poses") as raised:
             check_borne_out(shots, wrong, 0.3, 0.1, run)
         assert raised.value.code == 4 and "--force" in raised.value.fix
         run.force = True

@@ -31,8 +31,6 @@ CHECKED = 12  # photos from which on the poses are checked by leaving out half o
 BORNE_OUT = 0.25  # correlation of fine detail from which on a photo is taken to be in its place
 NODES, STEPS, TOLERANCE = 64, 150, 0.12  # of the coarse model whose surface shows fine detail
 FACES = 10_000  # of that surface
-
-
 CLEAR = 0.8  # agreement and share of borne-out photos from which on no other solution is sought
 
 

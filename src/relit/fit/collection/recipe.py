@@ -56,7 +56,7 @@ from relit.fit.shape.unseen import seen_faces
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values, row_features
 from relit.lighting.per_photo import COLUMNS, ROWS
-from relit.materials.field import normal_map, pictures, start_material
+from relit.materials.field import start_material
 from relit.recipe import FitContext, Recipe
 from relit.rendering.appearance.fixed_light import features_at
 from relit.rendering.transport import TraceableMesh
@@ -205,11 +205,8 @@ def surface_stage(
         silent = int((model.weights < 0.3).sum())
         if silent:
             run.say(f"note: {silent} photos were all but silenced: the model does not explain them")
-        names = ("base_color", "roughness", "metallic")
-        paint = dict(zip(names, pictures(model.material), strict=True))
         return PhotoLitMaterial(
-            **texels.painted(paint, seen_faces(mesh, shape.cameras)),
-            normal=normal_map(model.material),
+            **texels.material_maps(model.material, seen_faces(mesh, shape.cameras)),
             lights=np.exp(model.lights()).reshape(-1, ROWS, COLUMNS, 3),
             weights=model.weights,
         )

@@ -47,10 +47,14 @@ def contradictions(
         (
             agreement,
             agreement < LEAST,
-            f"{agreement:.0%} find their place in a model of the others",
+            f"{agreement:.0%} of the photos are found again in a model of the others",
         ),
-        (borne_out, borne_out < LEAST, f"fine detail bears out {borne_out:.0%}"),
-        (error, error > limit, f"they are {error:.0f} degrees from their hints (median)"),
+        (borne_out, borne_out < LEAST, f"fine detail confirms {borne_out:.0%}"),
+        (
+            error,
+            error > limit,
+            f"viewing directions are {error:.0f} degrees from the hints (median)",
+        ),
     ]
     known = [kind for kind in kinds if np.isfinite(kind[0])]
     return [text for _, against, text in known if against], len(known)
@@ -63,7 +67,7 @@ def check_borne_out(
     against, kinds = contradictions(photos, cameras, agreement, borne_out)
     if kinds >= LEAST_KINDS and len(against) == kinds:
         run.refuse(
-            f"the photos do not bear out where they were taken from: {'; '.join(against)}",
+            f"the photos contradict the camera poses that were found: {'; '.join(against)}",
             "poses are wrong as a whole, photos show different objects, or the object is plain and alike from several sides",
             "add photos between those that are far apart, answer `relit quadrants PHOTOS`, or look at the masks",
         )

@@ -56,7 +56,6 @@ from relit.fit.shape.mesh_stage import TexelMap, texels_of
 from relit.fit.shape.unseen import seen_faces
 from relit.geometry.se3 import nearest_rotation, rotation_angle, rotation_from
 from relit.lighting.gaussian_light import GaussianLight
-from relit.materials.field import normal_map, pictures
 from relit.recipe import FitContext, ObjectCost, Recipe
 from relit.scene import Asset, Camera, Capture, Ground, Instance, Material, Mesh, Pixels
 from relit.settings import check_levels
@@ -162,8 +161,6 @@ def surface_stage(
             hidden = hidden_from(lit.traced, lit.cameras)
             gathered = HiddenLight(lit.traced, hidden, lit.traced.only_blocks).before
         fit_surface(EnvironmentTerms(lit.bank, lit.traced, model, o, fit.seed, gathered), stage)
-        names = ("base_color", "roughness", "metallic")
-        paint = dict(zip(names, pictures(model.material), strict=True))
         # an instance with a guessed azimuth contributes no texture
         seen = shown_faces(lit.instances, pile.with_known_turn, lit.cameras)
         environment, ground = model.environment.image(), ground_colour(shots[0][0], pile.plane)
@@ -172,8 +169,7 @@ def surface_stage(
             ground = ground_reflectance(environment, up, level)
             environment = light_below(environment, up, level)
         return PileMaterial(
-            **texels.painted(paint, seen),
-            normal=normal_map(model.material),
+            **texels.material_maps(model.material, seen),
             environment=environment,
             ground_colour=ground,
         )

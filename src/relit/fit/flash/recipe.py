@@ -43,9 +43,9 @@ from relit.fit.passes.volume import (
     volume_result,
 )
 from relit.fit.shape.hollows import HollowOptions, open_hollows, without
-from relit.fit.shape.mesh_stage import TexelMap, outlined_mesh, texels_of, with_atlas
+from relit.fit.shape.mesh_stage import TexelMap, hull_of_masks, outlined_mesh, texels_of, with_atlas
 from relit.fit.shape.placing import placed_mesh
-from relit.geometry.hull import NoShape, visual_hull
+from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh
 from relit.geometry.sdf import dense_values
 from relit.masks.threshold import Backdrop
@@ -269,15 +269,7 @@ def intensity_of(photos: UnitPhotos) -> float:
 def opened_hull(photos: UnitPhotos, stage, fit: FitContext) -> VolumeModel:
     """The visual hull, opened where the photos contradict it."""
     run, options = fit.run, fit.options
-    try:
-        values = visual_hull(photos.cameras, photos.masks, options.levels[0])
-    except NoShape:
-        raise UserError(
-            "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
-            "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
-            "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS",
-            code=4,
-        ) from None
+    values = hull_of_masks(photos, options.levels[0], "--sphere X,Y,Z,RADIUS")
     if options.hollows > 0 and not stage.load("checkpoint"):
         o = HollowOptions(options.hollows)
         coarse = visual_hull(photos.cameras, photos.masks, o.nodes)

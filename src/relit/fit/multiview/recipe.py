@@ -48,13 +48,12 @@ from relit.fit.passes.volume import (
 )
 from relit.fit.shape.hollows import without
 from relit.fit.shape.lids import FIRST, open_lids
-from relit.fit.shape.mesh_stage import TexelMap, outlined_mesh, texels_of, with_atlas
+from relit.fit.shape.mesh_stage import TexelMap, hull_of_masks, outlined_mesh, texels_of, with_atlas
 from relit.fit.shape.placing import placed_mesh
 from relit.fit.shape.unseen import seen_faces, without_unseen
-from relit.geometry.hull import NoShape, visual_hull
+from relit.geometry.hull import visual_hull
 from relit.geometry.mesh import extract_mesh, vertex_areas
 from relit.geometry.se3 import align_cameras, nearest_rotation
-from relit.materials.field import normal_map, pictures
 from relit.materials.intrinsic import base_without_shading
 from relit.recipe import FitContext, Recipe
 from relit.rendering.appearance.fixed_light import mean_radiance
@@ -255,15 +254,8 @@ def masked_start(photos: UnitPhotos, stage, fit: FitContext) -> tuple[VolumeMode
     """The visual hull without the hollows that were found under its flat faces, and what takes
     these away from the distances of the next level, whose voxels show their rim and walls."""
     options = fit.options
-    try:
-        values = visual_hull(photos.cameras, photos.masks, options.levels[0])
-    except NoShape:
-        raise UserError(
-            "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
-            "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
-            "look at `relit inspect INPUT`; give --sphere X,Y,Z,RADIUS, or --masks none to do without masks",
-            code=4,
-        ) from None
+    without_masks = "--sphere X,Y,Z,RADIUS, or --masks none to do without masks"
+    values = hull_of_masks(photos, options.levels[0], without_masks)
     hollows = sought_hollows(photos, stage, fit) if options.hollows > 0 else None
     model = start_model(without(values, hollows), photos.level, None, full=False)
     return model, partial(without, hollows=hollows)
@@ -344,14 +336,12 @@ def mesh_stage(photos: UnitPhotos, volume: VolumeResult, fit: FitContext) -> Rad
 @dataclass(frozen=True)
 class LitMaterial:
     """Textures (S, S[, 3]) of a metallic-roughness material, linear: base_color, roughness,
-    metallic, normal (tangent space). f0: reflectance of its dielectric part. environment: (H, 2 H,
-    3) radiance, lat-long in the unit frame."""
+    metallic, normal (tangent space). environment: (H, 2 H, 3) radiance, lat-long in the unit frame."""
 
     base_color: np.ndarray
     roughness: np.ndarray
     metallic: np.ndarray
     normal: np.ndarray
-    f0: float
     environment: np.ndarray
 
 
@@ -365,12 +355,8 @@ def surface_stage(
         texels = texels_of(shaped.mesh, o.texture)
         model, traced = surface_start(bank, shaped, texels, stage, fit)
         fit_surface(EnvironmentTerms(bank, traced, model, o, fit.seed), stage)
-        names = ("base_color", "roughness", "metallic")
-        paint = dict(zip(names, pictures(model.material), strict=True))
         return LitMaterial(
-            **texels.painted(paint, seen_faces(shaped.mesh, cameras)),
-            normal=normal_map(model.material),
-            f0=float(model.material.f0),
+            **texels.material_maps(model.material, seen_faces(shaped.mesh, cameras)),
             environment=model.environment.image(),
         )
 

@@ -7,14 +7,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from relit.errors import EXIT_FAILED, UserError
 from relit.fit.passes.load_photos import UnitPhotos
 from relit.fit.shape.inpaint import painted_over
 from relit.fit.shape.odd_photos import check_overlaps, mask_overlaps, note_of_odd_photos
 from relit.fit.shape.outlines import follow_outlines
 from relit.geometry.atlas import unwrap
 from relit.geometry.bake import fill_gutters, interpolate, rasterise_atlas
+from relit.geometry.hull import NoShape, visual_hull
+from relit.materials.field import MaterialField, normal_map, pictures
 from relit.run import Run
 from relit.scene import Camera, Mesh
+
+
+def hull_of_masks(photos: UnitPhotos, nodes: int, else_give: str) -> np.ndarray:
+    """Distances (nodes, nodes, nodes) of the visual hull. else_give: what to give where there is
+    none, for the message. Raises UserError where the masks have no point of space in common."""
+    try:
+        return visual_hull(photos.cameras, photos.masks, nodes)
+    except NoShape:
+        raise UserError(
+            "the masks and the cameras do not agree: no point of space lies inside the masks of nearly all photos",
+            "wrong cameras, a wrong camera convention, inverted masks, or an object sphere that misses the object",
+            f"look at `relit inspect INPUT`; give {else_give}",
+            code=EXIT_FAILED,
+        ) from None
 
 
 def outlined_mesh(
@@ -71,11 +88,17 @@ class TexelMap:
         """The texture with its gutters filled."""
         return fill_gutters(texture, self.known)
 
-    def painted(self, textures: dict[str, np.ndarray], seen: np.ndarray) -> dict[str, np.ndarray]:
-        """The textures with gutters filled, and with the texels of faces that are not `seen` (F,)
-        continued from those that are."""
-        filled = {name: self.filled(texture) for name, texture in textures.items()}
-        return painted_over(self.mesh, seen, filled, self.face, self.bary)
+    def material_maps(self, material: MaterialField, seen: np.ndarray) -> dict[str, np.ndarray]:
+        """base_color, roughness, metallic and normal (tangent space) of a fitted material, gutters
+        filled. What lies on faces that are not `seen` (F,) continues what lies on those that
+        are; the normals stay."""
+        names = ("base_color", "roughness", "metallic")
+        paint = {
+            name: self.filled(texture)
+            for name, texture in zip(names, pictures(material), strict=True)
+        }
+        painted = painted_over(self.mesh, seen, paint, self.face, self.bary)
+        return {**painted, "normal": normal_map(material)}
 
 
 def texels_of(mesh: Mesh, size: int) -> TexelMap:

@@ -138,7 +138,7 @@ def place(
             views, crops, revolved.placed, o, seed=seed, links=links, say=say
         )
         if matched is not None:
-            return rounds_verified(views, crops, matched, o, True, seed=seed, say=say)[0]
+            return rounds_verified(views, crops, matched, o, seed=seed, say=say)[0]
     if revolved is not None and revolved.certain and mostly_sure(revolved.placed):
         return by_axes(revolved.placed, say)
     if revolved is not None:
@@ -168,10 +168,7 @@ def place(
         best = improved(
             views, crops, crop_rings(crops, DETAILED), best, o, seed=seed + 60, links=links, say=say
         )
-    if not believed(best, o):
-        doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
-        say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
-    found, rings = rounds_verified(views, crops, best, o, believed(best, o), seed=seed, say=say)
+    found, rings = rounds_verified(views, crops, best, o, seed=seed, say=say)
     if len(views) > 3:
         detailed = crop_rings(crops, DETAILED)
         turned = coherent_turns(views, crops, detailed, found.poses, o, seed=seed + 70, say=say)
@@ -196,13 +193,16 @@ def rounds_verified(
     crops,
     best: Placed,
     o: Search,
-    sure: bool,
     *,
     seed: int,
     say=lambda text: None,
 ) -> tuple[Placements, Rings]:
     """The set after rounds of a model of all and a search by rendering it, with contested instances
-    deferred where they can be spared; and the descriptors of the crops. sure: see `Placements`."""
+    deferred where they can be spared; and the descriptors of the crops."""
+    sure = believed(best, o)
+    if not sure:
+        doubtful = f"{len(best.unsure)} of {len(views)} were not sure of their places"
+        say(f"note: the poses are uncertain: {doubtful}: is the object nearly symmetric?")
     rings = crop_rings(crops, best.parts)
     poses, scores, contested = refine_and_verify(
         views, crops, rings, best.poses, best.own, o, seed=seed, parts=best.parts, say=say
@@ -219,13 +219,10 @@ def better_by_matches(
     decoration agrees better in it than in `revolved`; None where it does not, or matches hold
     together fewer than half. Outlines agree in every turn about the axis, so that decoration alone
     decides (`decoration_agreement`)."""
-    members, poses = max(
-        linked_sets(views, links, frame_scale(views)),
-        key=lambda one: len(one[0]),
-        default=([], None),
-    )
-    if poses is None or len(members) < max(3, len(views) / 2):
+    sets = linked_sets(views, links, frame_scale(views))
+    if not sets or len(sets[0][0]) < max(3, len(views) / 2):
         return None
+    members, poses = sets[0]
     rings = crop_rings(crops, DETAILED)
     try:
         grown = grow_instances(
