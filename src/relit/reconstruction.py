@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from relit import __version__
-from relit.errors import UserError
+from relit.errors import EXIT_USAGE, UserError, did_you_mean
 from relit.files import write_text
 from relit.job import (
     Cost,
@@ -25,7 +25,7 @@ from relit.job import (
     recipe_of,
 )
 from relit.log import readable_bytes, readable_seconds
-from relit.run import Run
+from relit.run import Run, StageReached
 from relit.scene import Capture
 from relit.settings import with_pairs, with_values
 
@@ -41,6 +41,7 @@ def reconstruct(
     overwrite: bool = False,
     report: bool = True,
     force: bool = False,
+    until: str = "",
     **flags,
 ) -> Path:
     """Photos -> `out`/asset; returns the asset folder. Giving the same call again resumes or finds
@@ -50,7 +51,8 @@ def reconstruct(
     no flag was given. pairs: 'key=value'
     texts, settings: {key: value}, both for the fields of the recipe's options (for example
     `relit.fit.multiview.recipe.MultiviewOptions`). report: write report.html as well. force: keep a result that its own evidence does not
-    bear out, which is refused (4) otherwise.
+    bear out, which is refused (4) otherwise. until: stop after this stage of the recipe and return the
+    run folder; the same call without it goes on.
     Raises UserError for bad input (3), a failed reconstruction (4), a lack of the machine (5),
     unknown settings (2).
     """
@@ -64,6 +66,12 @@ def reconstruct(
     recipe = recipe_of(kind)
     options = with_values(recipe.options(job.quality), from_file, f"--config {config}")
     options = with_values(with_pairs(options, pairs), settings or {}, "settings")
+    if until and until not in recipe.stages:
+        raise UserError(
+            f"no stage '{until}' in the recipe {recipe.name}.{did_you_mean(until, recipe.stages)}",
+            fix=f"choose of: {', '.join(recipe.stages)}",
+            code=EXIT_USAGE,
+        )
     cost = estimate(capture, job, kind, options)
     check_memory(cost)
     record = {
@@ -73,7 +81,7 @@ def reconstruct(
         "settings": dataclasses.asdict(options),
     }
     with Run.open(out, record, resume=not overwrite, inputs=input_digests(capture)) as run:
-        run.force = force
+        run.force, run.until = force, until
         asset_folder = run.folder / "asset"
         finished = run.done("asset") and (asset_folder / "asset.json").is_file()
         reported = run.done("report") and (run.folder / "report.html").is_file()
@@ -89,7 +97,13 @@ def reconstruct(
         if not recipe.finds_cameras:
             capture = with_cameras(capture, run, job)
         if not finished:
-            asset = recipe.run(capture, run, options, job.seed)
+            try:
+                asset = recipe.run(capture, run, options, job.seed)
+            except StageReached as reached:
+                run.say(
+                    f"stopped after the stage '{reached}'; the same command without --until goes on"
+                )
+                return run.folder
             unchanged(run, given)
             _save(run, asset, capture, kind, job, chosen)
         if not (run.folder / "photos" / "index.json").is_file():

@@ -50,6 +50,10 @@ RUN_FORMAT = 3  # of the stages' results; a run folder of another format is refu
 OWNED = (*FILES, "stages", "previews", "photos", "asset")
 
 
+class StageReached(Exception):
+    """The stage after which a run was to stop (`Run.until`) has ended."""
+
+
 class Terminated(BaseException):
     """SIGTERM, raised in the main thread so that files are closed and the lock is dropped."""
 
@@ -63,11 +67,13 @@ STOPS: dict[int, type[BaseException]] = {
 class Run:
     """One run folder, held by this process. Make it with `Run.open`; it is a context manager.
 
-    force: keep a result that its own evidence does not bear out, see `refuse`.
+    force: keep a result that its own evidence does not bear out, see `refuse`. until: name of the
+    stage to stop after, '' for none.
     """
 
     def __init__(self, folder: Path, config: dict, lock: int, log: Log):
-        self.folder, self.config, self.log, self.force = folder, config, log, False
+        self.folder, self.config, self.log = folder, config, log
+        self.force, self.until = False, ""
         self._unlock = weakref.finalize(self, os.close, lock)
 
     @staticmethod
@@ -208,8 +214,15 @@ class Run:
         """The result of a stage: computed by `compute(stage)` and kept, or read back when done.
 
         kind: its type, a frozen dataclass (see `relit.records`). title, steps: see `stage`.
-        Raises UserError where the result of a finished stage cannot be read.
+        Raises UserError where the result of a finished stage cannot be read, StageReached after the
+        stage `until`.
         """
+        result = self._cached(name, kind, compute, title, steps)
+        if name == self.until:
+            raise StageReached(name)
+        return result
+
+    def _cached(self, name: str, kind: type[T], compute, title: str | None, steps: int | None) -> T:
         if not self.done(name):
             with self.stage(name, steps=steps, title=title) as stage:
                 arrays = to_arrays(compute(stage))

@@ -238,13 +238,15 @@ class Instance:
     label: its number in the label image. world_from_object: (4, 4) similarity from the asset frame,
     None where it was not registered.
     reason: why not; of one that was, what is uncertain about its pose. photo: number of the photo,
-    from 0, that the label is of.
+    from 0, that the label is of. chance_wrong: of its pose, by what a model of the others says; None
+    where it was not asked.
     """
 
     label: int
     world_from_object: np.ndarray | None
     reason: str = ""
     photo: int = 0
+    chance_wrong: float | None = None
 
     @property
     def registered(self) -> bool:

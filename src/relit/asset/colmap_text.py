@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from relit.scene import Camera
 
@@ -38,17 +39,6 @@ def write_colmap(folder: str | Path, cameras: Sequence[tuple[str, Camera]]) -> P
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(4,) unit (w, x, y, z), w >= 0, of a rotation matrix (3, 3): largest eigenvector of a
-    symmetric matrix (Bar-Itzhack 2000)."""
-    r = np.asarray(rotation, np.float64)
-    k = np.array(
-        [
-            [r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]],
-            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]],
-            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(k / 3)[1][:, -1]
-    q = np.array([w, x, y, z])
-    return -q if w < 0 else q
+    """(4,) unit (w, x, y, z), w >= 0, of a rotation matrix (3, 3)."""
+    x, y, z, w = Rotation.from_matrix(np.asarray(rotation, np.float64)).as_quat(canonical=True)
+    return np.array([w, x, y, z])

@@ -7,7 +7,8 @@ with one node for each of them.
      "roughness": .8}}
 
 An instance that the first photo does not show has the number of the photo whose label it is,
-`"photo": 2`. A registered instance has a reason where its pose is uncertain. The object frame is
+`"photo": 2`. A registered instance has a reason where its pose is uncertain, and the chance that it
+is wrong, `"chance_wrong": .04`, where it was asked against a model of the others. The object frame is
 the asset frame (the GLB's coordinates after its node transforms), the world that of `cameras.json`.
 """
 
@@ -34,6 +35,8 @@ def write_instances(folder: Path, asset: Asset) -> None:
             entry["photo"] = int(i.photo) + 1
         if i.registered:
             entry["world_from_object"] = np.asarray(i.world_from_object, np.float64).tolist()
+        if i.chance_wrong is not None:
+            entry["chance_wrong"] = round(float(i.chance_wrong), 3)
         if i.reason or not i.registered:
             entry["reason"] = i.reason
         listed.append(entry)
@@ -87,7 +90,13 @@ def read_instances(folder: Path) -> tuple[tuple[Instance, ...], Ground | None]:
                     raise ValueError("a pose is no regular 4 x 4 matrix")
             photo = int(entry.get("photo", 1)) - 1
             instances.append(
-                Instance(int(entry["label"]), pose, str(entry.get("reason", "")), photo)
+                Instance(
+                    int(entry["label"]),
+                    pose,
+                    str(entry.get("reason", "")),
+                    photo,
+                    None if entry.get("chance_wrong") is None else float(entry["chance_wrong"]),
+                )
             )
         ground = None
         if data.get("ground"):

@@ -143,6 +143,12 @@ def reconstruct_flags(parser: Parser) -> None:
         action="store_true",
         help="keep a result that the photos do not bear out (exit code 4 otherwise)",
     )
+    parser.more.add_argument(
+        "--until",
+        default="",
+        metavar="STAGE",
+        help="stop after this stage, for example poses; the run goes on without it",
+    )
 
 
 def do_reconstruct(args) -> None:
@@ -160,8 +166,9 @@ def do_reconstruct(args) -> None:
         **{name: getattr(args, name) for name in OPENING},
         overwrite=args.overwrite,
         force=args.force,
+        until=args.until,
     )
-    print(asset / "object.glb")
+    print(asset if args.until else asset / "object.glb")
 
 
 # ---------------------------------------------------------------- quadrants

@@ -5,7 +5,7 @@ released data.
     train/000_rgb.png             the photo, 8-bit sRGB (001_rgb.png ... where there are several)
     train/000_instance_seg.png    one grey level for each object, 0 for the rest
     truth/truth.json              poses, visible shares, ground, settings; written last
-    truth/mesh.ply  truth/environment.exr
+    truth/mesh.ply  truth/object.glb  truth/environment.exr
     truth/test/t_000.exr ...      novel views of the whole pile, with _albedo, _roughness,
                                   _metallic, _normal, _labels
     truth/relight/LIGHT.exr  truth/relight/LIGHT/t_000.exr ...
@@ -40,7 +40,7 @@ from relit.synthesize.multiview import (
     write_json,
 )
 
-VERSION = 2
+VERSION = 3
 FOV = 38.0  # degrees, the shorter side of the photo
 ELEVATION = 55.0  # degrees, of the photo's camera
 STEP = 35.0  # degrees around the pile from one photo to the next
@@ -94,7 +94,7 @@ def synthesize_duplicates(
     if claim_folder(out, settings):
         return out
 
-    from relit.asset.gltf import read_asset_file
+    from relit.asset.gltf import read_asset_file, write_glb
     from relit.images import read_image, write_linear, write_srgb
     from relit.reference.mitsuba_scene import build_scene, render, render_channels
     from relit.reference.pile import build_pile, instance_ids
@@ -169,6 +169,7 @@ def synthesize_duplicates(
                 )
         say(f"test views under {file.stem}")
     _write_mesh(truth / "mesh.ply", mesh)
+    write_glb(truth / "object.glb", mesh, material)
     write_json(
         out / "transforms_train.json",
         _cameras([(f"train/{k:03d}", c) for k, c in enumerate(shots)]),

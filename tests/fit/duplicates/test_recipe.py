@@ -17,11 +17,13 @@ from relit.capture.open import open_capture
 from relit.conventions import move_points, similarity
 from relit.errors import UserError
 from relit.evaluate.dispatch import evaluate
+from relit.evaluate.registration import evaluate_registration
 from relit.fit.duplicates import pose_passes, recipe, shape
 from relit.fit.duplicates import poses as poses_stage
 from relit.fit.duplicates import recover_unregistered as found_again
 from relit.fit.duplicates.mirrored_silhouettes import Symmetry
 from relit.fit.registration.instances import outliers as odd
+from relit.fit.registration.instances.left_out import LeftOut
 from relit.fit.registration.instances.views import ViewId
 from relit.fit.registration.placements import all_placed
 from relit.geometry.sdf import node_positions
@@ -30,7 +32,7 @@ from relit.geometry.symmetry import Plane
 from relit.images import write_linear
 from relit.recipe import FitContext
 from relit.records import from_arrays, to_arrays
-from relit.run import Run
+from relit.run import Run, StageReached
 from relit.scene import Mesh
 from relit.synthesize.duplicates import RADIUS, heap, synthesize_duplicates
 from relit.synthesize.procedural import pawn
@@ -57,8 +59,13 @@ def stand_in(monkeypatch, poses, unsure=0.0):
     )
     monkeypatch.setattr(
         poses_stage,
-        "ambiguous",
-        lambda views, *_, **__: np.array([unsure] + [0.0] * (len(views) - 1)),
+        "leave_out",
+        lambda views, *_, **__: LeftOut(
+            np.full(len(views), 0.95),
+            np.full(len(views), 0.9),
+            np.array([0.95 if unsure else 0.5] + [0.5] * (len(views) - 1)),
+            np.array([unsure] + [0.0] * (len(views) - 1)),
+        ),
     )
 
 
@@ -129,6 +136,20 @@ def test_without_the_search_one_set_that_matches_hold_together_is_left():
 
 
 @pytest.mark.slow
+def test_poses_alone_are_measured_after_the_stage_that_finds_them(pile, tmp_path, monkeypatch):
+    stand_in(monkeypatch, true_poses(pile))
+    options = replace(recipe.options_for("draft"), side=64)
+    with Run.open(tmp_path / "run", {"capture": "duplicates"}) as run:
+        run.until = "poses"
+        with pytest.raises(StageReached, match="poses"):
+            recipe.reconstruct(open_capture(pile), run, options, 0)
+    assert {s["name"] for s in run.stages()} == {"poses"}
+    got = {k: v["value"] for k, v in evaluate_registration(run.folder, pile)["metrics"].items()}
+    assert got["rotation_median"] < 1 and got["wrong"] == got["wrong_sure"] == 0
+    assert got["determined_sure"] == 100 and got["stated_wrong"] < 10
+
+
+@pytest.mark.slow
 def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
     stand_in(monkeypatch, true_poses(pile), unsure=90.0)
     capture = open_capture(pile)
@@ -148,7 +169,9 @@ def test_from_photo_to_figures(pile, tmp_path, monkeypatch):
         resumed = recipe.reconstruct(capture, run, options, 0)
     assert np.allclose(asset.mesh.vertices, resumed.mesh.vertices)
     assert len(asset.instances) == 4 and all(i.registered for i in asset.instances)
-    assert "1 of 4 poses are ambiguous" in (run.folder / "log.txt").read_text()
+    chances = [i.chance_wrong for i in asset.instances]
+    assert chances[0] > 0.5 > max(chances[1:])
+    assert "1 of 4 poses are uncertain" in (run.folder / "log.txt").read_text()
     assert [bool(i.reason) for i in asset.instances] == [
         True,
         False,

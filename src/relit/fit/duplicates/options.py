@@ -14,7 +14,8 @@ class DuplicatesOptions:
     """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for
     all poses. searches: of few objects (up to 8) from the start, until two of them agree.
     regrowths: times that objects which were not sure of their places are taken out and join again.
-    levels, level_steps, rays: of the volume pass. refine_poses: step of the pose corrections in it
+    search_effort: coarse models that the search for poses may fit before it ends with what it has,
+    for every two instances (fit/duplicates/poses.py). levels, level_steps, rays: of the volume pass. refine_poses: step of the pose corrections in it
     (radians, unit lengths). faces,
     texture: of the object. outlines: rounds in which the poses and the mesh follow the labels
     (fit/shape/outlines.py). surface_steps, points,
@@ -30,6 +31,7 @@ class DuplicatesOptions:
     search_rounds: int = 1
     searches: int = 3
     regrowths: int = 12
+    search_effort: float = 22.0
     levels: tuple[int, ...] = (48, 96, 192)
     level_steps: tuple[int, ...] = (400, 500, 400)
     rays: int = 6144
@@ -80,6 +82,7 @@ PRESETS = {
         "side": 200,
         "searches": 1,
         "regrowths": 4,
+        "search_effort": 12.0,
         "levels": (48, 96),
         "level_steps": (150, 200),
         "rays": 4096,

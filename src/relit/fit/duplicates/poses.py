@@ -15,9 +15,11 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates.options import DuplicatesOptions
+from relit.fit.duplicates.verdict import UNCERTAIN, judge_pile_poses
+from relit.fit.registration.instances.effort import Effort
 from relit.fit.registration.instances.growth import viewing_directions
-from relit.fit.registration.instances.options import Search
-from relit.fit.registration.instances.rounds import ambiguous
+from relit.fit.registration.instances.left_out import leave_out
+from relit.fit.registration.instances.options import Growth, Search
 from relit.fit.registration.instances.trials import place_few
 from relit.fit.registration.instances.views import COARSE, InstanceView, ViewId, carved, views_of
 from relit.fit.registration.placements import Placements, Status
@@ -30,6 +32,9 @@ from relit.scene import Camera, Pixels
 # wrong
 FAR = 45.0
 APART = 100.0  # degrees between two groups of sides from which on hardly anything is shown by both
+# half instances that are added to the number of them where the effort of the search is limited: few
+# take more tries than many
+ALWAYS = 10
 AGREES = 0.2  # an instance whose score lies further below the median did not find its place
 
 Shot = tuple[Pixels, Camera]  # a decoded photo and its camera in its own frame (identity pose)
@@ -49,7 +54,9 @@ class PilePoses:
     """Poses of all views. ids: names of the views. poses: (N, 4, 4) object_from_camera, in a frame
     whose unit sphere holds the object. registered: (N,) bool. axis_only: (N,) bool, not registered
     but right up to a turn about the object's y axis. scores: (N,). turns: (N,) degrees by which a
-    registered instance agrees about as well, 0 where it does not (`ambiguous`)."""
+    registered instance agrees about as well or better with a model of the others, 0 where it does not.
+    chances: (N,) of a pose being wrong (`LeftOut.chance_wrong`), NaN where it was not asked.
+    contradicted: see `LeftOut`."""
 
     ids: tuple[ViewId, ...]
     poses: np.ndarray
@@ -57,14 +64,20 @@ class PilePoses:
     axis_only: np.ndarray
     scores: np.ndarray
     turns: np.ndarray
+    chances: np.ndarray
+    contradicted: bool
 
 
 def poses_stage(shots: list[Shot], fit: FitContext) -> PilePoses:
     """Poses of all views of all photos. Raises UserError where hardly any can be placed."""
     title = "poses of the instances"
-    return fit.run.cached(
+    found = fit.run.cached(
         "poses", PilePoses, lambda stage: find_pile_poses(shots, fit), title=title
     )
+    names = [f"label {i.label}" + photo_suffix(i.photo) for i in found.ids]
+    chosen = np.flatnonzero(found.registered)
+    judge_pile_poses([names[k] for k in chosen], found.chances[chosen], found.contradicted, fit.run)
+    return found
 
 
 def find_pile_poses(shots: list[Shot], fit: FitContext) -> PilePoses:
@@ -73,10 +86,12 @@ def find_pile_poses(shots: list[Shot], fit: FitContext) -> PilePoses:
     views = all_views(shots, COARSE, options)
     matched = None if "matching" in options.without else match_instances(shots, run, options, seed)
     descents = {"descents": 0} if "refinement" in options.without else {}
+    effort = Effort(options.search_effort * (len(views) / 2 + ALWAYS))
     search = Search(
         rounds=options.search_rounds,
         searches=options.searches,
         regrowths=options.regrowths,
+        growth=Growth(effort=effort),
         **descents,
     )
     links = matched.told if matched else ()
@@ -89,12 +104,19 @@ def find_pile_poses(shots: list[Shot], fit: FitContext) -> PilePoses:
             "check the label image; more instances, or a photo in which they are larger, help",
             code=EXIT_FAILED,
         ) from None
+    run.log.note(f"the search has fitted {effort.spent:.0f} coarse models")
+    if effort.over:
+        run.say(
+            f"note: the search has ended at its limit of {effort.limit:.0f} coarse models, with the best poses so far; --set search_effort={2 * options.search_effort:g} doubles it"
+        )
     registered = registered_of(views, found, links, fit)
     some = [v for v, ok in zip(views, registered, strict=True) if ok]
     poses, turns = found.poses, np.zeros(len(views))
+    chances, contradicted = np.full(len(views), np.nan), False
     if registered.sum() > 2 and "refinement" not in options.without:
-        turns[registered] = ambiguous(some, poses[registered], search, seed=seed)
-        say_ambiguous(views, turns, int(registered.sum()), run)
+        asked = leave_out(some, poses[registered], search, seed)
+        chances[registered], contradicted = asked.chance_wrong, asked.contradicted
+        turns[registered] = np.where(asked.chance_wrong >= UNCERTAIN, asked.away, 0)
     say_far_apart(some, poses[registered], run)
     if matched and not {"guided", "refinement"} & set(options.without):
         poses = adjusted_poses(matched, poses, registered, run)
@@ -105,6 +127,8 @@ def find_pile_poses(shots: list[Shot], fit: FitContext) -> PilePoses:
         axis_only=found.having(Status.AXIS_ONLY),
         scores=found.scores,
         turns=turns,
+        chances=chances,
+        contradicted=contradicted,
     )
 
 
@@ -142,18 +166,6 @@ def linked_together(count: int, told: tuple) -> np.ndarray:
         coo_matrix((np.ones(len(i)), (i, j)), (count, count)), directed=False
     )
     return member == np.bincount(member).argmax()
-
-
-def say_ambiguous(views: list[InstanceView], unsure: np.ndarray, registered: int, run) -> None:
-    """Say whose poses the pictures do not tell. unsure: (N,) degrees, see
-    `instance_rounds.ambiguous`."""
-    some = [instance_name(views[k]).removeprefix("label ") for k in np.flatnonzero(unsure)]
-    if some:
-        run.say(
-            f"note: {len(some)} of {registered} poses are ambiguous (labels {', '.join(some)}): these objects agree about as well with the "
-            f"model when turned by {np.median(unsure[unsure > 0]):.0f} degrees; the object is nearly symmetric, its texture repeats, or "
-            "what tells is hidden"
-        )
 
 
 def say_far_apart(views: list[InstanceView], poses: np.ndarray, run) -> None:
@@ -198,7 +210,12 @@ def widest_gap(away: np.ndarray) -> tuple[float, np.ndarray]:
 
 def instance_name(view: InstanceView) -> str:
     """How messages call an instance."""
-    return f"label {view.label}" + (f" in photo {view.photo + 1}" if view.photo else "")
+    return f"label {view.label}" + photo_suffix(view.photo)
+
+
+def photo_suffix(photo: int) -> str:
+    """What is added to a label of a further photo. photo: its number, from 0."""
+    return f" in photo {photo + 1}" if photo else ""
 
 
 @dataclass(frozen=True)

@@ -301,7 +301,7 @@ def listed_instances(
 ) -> tuple[Instance, ...]:
     """All instances, with the reason where a pose is missing or uncertain."""
     out = []
-    for name, turn in zip(found.ids, found.turns, strict=True):
+    for name, turn, chance in zip(found.ids, found.turns, found.chances, strict=True):
         if name in pile.ids:
             doubt = (
                 f"ambiguous: turned by {turn:.0f} degrees it agrees about as well" if turn else ""
@@ -309,7 +309,8 @@ def listed_instances(
             if name in pile.guessed:
                 doubt = "ambiguous: its turn about the axis of the object is a guess"
             pose = world_from_object[pile.ids.index(name)]
-            out.append(Instance(name.label, pose, doubt, name.photo))
+            known = float(chance) if np.isfinite(chance) else None
+            out.append(Instance(name.label, pose, doubt, name.photo, known))
         elif name not in pile.views and pile.related[name.photo]:
             reason = "it agrees too little with the model of the others"
             out.append(Instance(name.label, None, reason, name.photo))

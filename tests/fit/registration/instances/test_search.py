@@ -19,6 +19,7 @@ from relit.fit.registration.instances.growth import (
     linked_poses,
 )
 from relit.fit.registration.instances.guesses import Guesses, first_pairs
+from relit.fit.registration.instances.left_out import LeftOut, leave_out
 from relit.fit.registration.instances.links import linked_sets
 from relit.fit.registration.instances.lookup import look_for
 from relit.fit.registration.instances.options import DETAILED, Growth, Search
@@ -32,7 +33,6 @@ from relit.fit.registration.instances.regrowth import (
 )
 from relit.fit.registration.instances.rounds import (
     LOW,
-    ambiguous,
     instance_crops,
     nearer,
     reconsider,
@@ -671,12 +671,29 @@ def test_an_object_half_hidden_is_found_where_the_seen_half_alone_would_mislead(
 
 
 @pytest.mark.slow
-def test_poses_of_a_ball_are_ambiguous_and_those_of_a_painted_body_are_not():
+def test_a_model_of_the_others_bears_out_right_poses_and_no_wrong_ones():
     o = Search(nodes=24, steps=12, viewpoints=300)
-    views, truth = painted([0, 25, 50])
-    assert (ambiguous(views, truth, o) == 0).all()
-    plain, poses = painted([0, 25, 50], axes=(0.5, 0.5, 0.5), contrast=0.0)
-    assert (ambiguous(plain, poses, o) >= ANOTHER).all()
+    views, truth = painted([0, 20, 40, 60])
+    right = leave_out(views, truth, o)
+    assert (right.lead > 0).all() and (right.chance_wrong < 0.5).all()
+    wrong = truth.copy()
+    turn = similarity(exp_so3(np.array([0.0, 0.0, 2.0])), np.zeros(3))
+    wrong[1] = turn @ wrong[1]
+    asked = leave_out(views, wrong, o)
+    assert asked.lead[1] < 0 and asked.chance_wrong[1] == asked.chance_wrong.max()
+    assert asked.away[1] >= ANOTHER
+    plain, poses = painted([0, 20, 40, 60], axes=(0.5, 0.5, 0.5), contrast=0.0)
+    assert (leave_out(plain, poses, o).lead < 0.05).all()  # a ball tells no pose
+
+
+def test_the_share_of_wrong_poses_falls_with_their_lead():
+    lead = np.array([-0.2, -0.05, 0.0, 0.05, 0.2])
+    asked = LeftOut(np.full(5, 0.9), 0.7 + lead, np.full(5, 0.7), np.full(5, 90.0))
+    assert (np.diff(asked.chance_wrong) < 0).all() and 0 < asked.chance_wrong.min()
+    alone = LeftOut(
+        np.ones(1), np.array([0.9]), np.array([-1.0]), np.zeros(1)
+    )  # no other pose was found
+    assert alone.lead[0] == pytest.approx(0.9)
 
 
 def test_distances_are_held_once_asked_to_and_nothing_else_is():

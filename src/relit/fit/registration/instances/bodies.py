@@ -65,6 +65,7 @@ def fit_body(
     if plane is not None:
         views, poses = [*views, *views], np.concatenate([poses, plane.mirror @ poses])
     values = taut_body(views, poses, o.nodes, o.tolerance, o.depth, crossed=count > 3)
+    o.effort.spend(steps)
     model, moved = fit_model(
         views, poses, values, steps, refine_cameras=o.rate, rays=o.rays, seed=seed
     )

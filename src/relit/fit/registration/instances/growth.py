@@ -199,7 +199,7 @@ def ahead(
         (int(place), int(i))
         for place, i in zip(*np.unravel_index(found, heights.shape), strict=True)
     ]
-    if len(rest) == 1:
+    if len(rest) == 1 or o.effort.over:
         return tried[0]
     branches = []
     for place, i in tried:

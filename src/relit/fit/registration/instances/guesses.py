@@ -56,6 +56,7 @@ def pair_guesses(
     directions = directions_around(o.viewpoints, seed)
     for s, k in enumerate(chosen):
         pose = first_pose(views[k], distance)
+        o.effort.spend(o.steps)
         model, _ = fit_model(
             [views[k]], pose[None], inflate_silhouette(views[k], pose, o.nodes), o.steps, seed=seed
         )

@@ -115,6 +115,8 @@ def coherent_turns(
         return None
     first: Turned | None = None
     for turn in alike_turns(body.gallery, TRIED):
+        if o.effort.over:
+            break
         try:
             sought = by_silhouettes(asked, body, poses if exact else body.poses, turn)
             if sought is None:
@@ -271,6 +273,8 @@ def one_at_a_time(asked: Asked, poses: np.ndarray, turn: AlikeTurn) -> Turned:
         ways = [(k, s) for k in range(count) for s in range(1, len(motions))]
         ways.sort(key=lambda way: shapes.gap(np.where(np.arange(count) == way[0], way[1], none)))
         for k, s in ways[:ASKED]:
+            if asked.options.effort.over:
+                return best
             other = best.poses.copy()
             other[k] = motions[s] @ other[k]
             tried = score_settled_poses(asked, other)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from relit.fit.registration.instances.effort import Effort
+
 # weights in fit.register's descriptors: decoration tells most, and of an object without it colour
 DETAILED, COLOURFUL = (0.6, 1.0, 0.1, 0.6), (0.6, 2.0, 0.1)
 
@@ -21,7 +23,8 @@ class Growth:
     ahead_steps, ahead_views: where there are none, so many ways to join are tried, each with a fit
     of so many steps and so many views of it (fit/registration/instances/lookahead.py). leap: spread
     of their values within which a draw decides, when instances are grown again.
-    astray: a member whose score lies so much below the median is taken out again.
+    astray: a member whose score lies so much below the median is taken out again. effort: of the
+    whole search.
     """
 
     nodes: int = 40
@@ -39,6 +42,7 @@ class Growth:
     sure: float = 0.06
     sure_of_few: float = 0.1
     leap: float = 0.01
+    effort: Effort = field(default_factory=Effort, compare=False)
 
 
 @dataclass(frozen=True)
@@ -81,3 +85,8 @@ class Search:
     rounds_doubted: int = 5
     late: int = 3
     growth: Growth = field(default_factory=Growth)
+
+    @property
+    def effort(self) -> Effort:
+        """Of the whole search; growth counts on the same one."""
+        return self.growth.effort

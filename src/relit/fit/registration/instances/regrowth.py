@@ -112,7 +112,7 @@ def confirmed(
 ) -> Placed:
     """The set with those who were unsure taken out and asked again once all others stand, as long
     as fewer are unsure each time."""
-    while not believed(placed, o):
+    while not believed(placed, o) and not o.effort.over:
         stay = [k for k in range(len(views)) if k not in placed.unsure]
         if len(stay) < max(2, len(views) / 2) or not placed.unsure:
             break
@@ -156,6 +156,8 @@ def improved(
     """
     rng, idle = np.random.default_rng(seed), 0
     for turn in range(tries or max(2, round(o.regrowths * min(1.0, TEN / len(views))))):
+        if o.effort.over:
+            break
         stay = staying(best, turn, rng)
         again = grown_again(
             views, crops, rings, best, stay, DETAILED, o, seed=seed + turn, links=links, rng=rng

@@ -152,6 +152,7 @@ def decoration_agreement(
         values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
     except NoShape:
         return -np.inf
+    o.effort.spend(steps)
     model, poses = fit_model(
         views, poses, values, steps, refine_cameras=o.rate, hold=o.steps // 2, seed=seed
     )

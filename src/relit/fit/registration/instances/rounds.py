@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from relit.fit.registration.instances.growth import ANOTHER, grow_instances
+from relit.fit.registration.instances.growth import grow_instances
 from relit.fit.registration.instances.lookup import look_for
 from relit.fit.registration.instances.options import DETAILED, Search
 from relit.fit.registration.instances.views import (
@@ -35,7 +35,6 @@ from relit.fit.registration.register import (
 from relit.geometry.hull import NoShape
 from relit.geometry.se3 import rotation_angle
 
-UNSURE = 0.3  # see `ambiguous`
 GAP = 0.1  # an instance's score may lie so much below those of the best third
 LOW = 0.1  # see `regrown`: so much below the median
 REGROWN = 2  # times at most
@@ -67,6 +66,7 @@ def settle_instances(
         nodes = o.nodes if turn < 2 else round(1.3 * o.nodes)
         some = [views[k] for k in use]
         values = taut_body(some, poses[use], nodes, 0.15, o.depth)
+        o.effort.spend(2 * o.steps)
         model, poses[use] = fit_model(
             some, poses[use], values, 2 * o.steps, refine_cameras=o.rate, seed=seed + turn
         )
@@ -122,6 +122,7 @@ def refine_jointly(
     some, others = [views[k] for k in use], np.setdiff1d(np.arange(len(views)), use)
     for turn in range(o.descents):
         values = carved(some, poses[use], o.nodes + 8, 0.15, o.depth, crossed=True)
+        o.effort.spend(2 * o.steps)
         model, poses[use] = fit_model(
             some,
             poses[use],
@@ -182,7 +183,7 @@ def refine_and_verify(
             sure=sure,
             say=say,
         )
-        if not moved:
+        if not moved or o.effort.over:
             break
         again, level = refine_jointly(
             views, crops, rings, sent.copy(), scores, o, seed=seed + 40 + turn, parts=parts, say=say
@@ -200,7 +201,7 @@ def refine_and_verify(
         }  # brought back: asked again, they would be sent again
         late, poses, scores, agreement = True, again, level, max(agreement, better)
     for turn in range(
-        o.late if late else 0
+        o.late if late and not o.effort.over else 0
     ):  # those that came late have had the fewest descents, and hold the others back
         before = poses.copy()
         poses, scores = refine_jointly(
@@ -262,6 +263,7 @@ def reconsider(
         rest = [j for j in range(len(views)) if j != k]
         some = [views[j] for j in rest]
         values = taut_body(some, poses[rest], o.nodes, 0.15, o.depth, crossed=len(rest) > 3)
+        o.effort.spend(2 * o.steps)
         model, _ = fit_model(some, poses[rest], values, 2 * o.steps, seed=seed + turn)
         render, own = albedo_render(model), chosen_rings(rings, [k])
         best, score = refine(
@@ -316,7 +318,7 @@ def regrown(
         detail, own = crop_rings(crops, DETAILED), model_of_all(views, poses, o, seed=seed)[1]
         for turn in range(REGROWN):
             low = own < np.median(own) - LOW
-            if not low.any():
+            if not low.any() or o.effort.over:
                 break
             rest, again = np.flatnonzero(~low).tolist(), poses.copy()
             some, theirs, own_rings = (
@@ -353,36 +355,11 @@ def regrown(
     return poses, scores
 
 
-def ambiguous(
-    views: list[InstanceView], poses: np.ndarray, o: Search, *, seed: int = 0
-) -> np.ndarray:
-    """(N,) degrees by which another pose of an instance that the pictures hardly tell from its own
-    is turned against it, 0 where there is
-    none: it agrees with the model of all so well that what the own one falls short of 1 grows by
-    less than the share UNSURE."""
-    parts, crops = DETAILED, instance_crops(views)
-    rings = crop_rings(crops, parts)
-    render, own = model_of_all(views, poses, o, seed=seed)
-    far = eyes_at(poses)
-    gallery = make_gallery(render, views_from(directions_around(o.viewpoints, seed), far), parts)
-    found = look_for(views, crops, gallery, rings, parts, keep=3, apart=ANOTHER)
-    best, angle = own - UNSURE * (1 - own), np.zeros(len(views))
-    for n in range(found.poses.shape[1]):
-        other, score = refine(
-            crops, found.poses[:, n], render, rings=rings, steps=(0, 4.0, 2.0), parts=parts
-        )
-        away = np.array(
-            [rotation_angle(a[:3, :3].T @ b[:3, :3]) for a, b in zip(other, poses, strict=True)]
-        )
-        better = (away >= ANOTHER) & (score > best)
-        best, angle = np.where(better, score, best), np.where(better, away, angle)
-    return angle
-
-
 def model_of_all(views: list[InstanceView], poses: np.ndarray, o: Search, *, seed: int = 0):
     """What renders a model that is fitted to all views, and the scores (N,) of all against it."""
     crops = instance_crops(views)
     values = carved(views, poses, o.nodes + 8, 0.15, o.depth, crossed=True)
+    o.effort.spend(2 * o.steps)
     model, _ = fit_model(views, poses, values, 2 * o.steps, seed=seed)
     render = albedo_render(model)
     return render, refine(

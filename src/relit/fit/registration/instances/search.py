@@ -296,7 +296,8 @@ def grown_from_pairs(
     }
     for turn in range(o.starts):
         for parts in starts:
-            if turn >= len(starts[parts]) or believed(best, o):
+            spent = best is not None and o.effort.over
+            if turn >= len(starts[parts]) or believed(best, o) or spent:
                 continue
             start, poses = starts[parts][turn]
             try:

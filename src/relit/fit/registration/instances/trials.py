@@ -4,15 +4,15 @@ Of six objects two in wrong places can bear each other out: the model of all tak
 score within one search tells. A search in which nearly all were sure of their places is believed.
 Otherwise another seed begins from other viewpoints and ends elsewhere, unless
 the poses are right: searches that come to the same poses are believed, and where no two do, the one
-whose objects agree best with a model of all of them.
+whose objects agree best, each with a model of the others.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from relit.fit.registration.instances.left_out import leave_out
 from relit.fit.registration.instances.options import Search
-from relit.fit.registration.instances.rounds import model_of_all
 from relit.fit.registration.instances.search import place
 from relit.fit.registration.instances.views import InstanceView
 from relit.fit.registration.placements import Placements
@@ -37,14 +37,13 @@ def place_few(
             if trial == o.searches - 1 and not found:
                 raise
             continue
-        if one.sure:
+        if one.sure or o.effort.over:
             return one
-        _, own = model_of_all(views, one.poses, o, seed=seed)
-        agreement = float(own.mean())
+        agreement = float(leave_out(views, one.poses, o, seed).own.mean())
         like = [other for other in found if turned_apart(one.poses, other[1].poses) < SAME]
         found.append((agreement, one))
         say(
-            f"search {trial + 1} of at most {o.searches}: agreement of all with a model of all {agreement:.3f}"
+            f"search {trial + 1} of at most {o.searches}: mean agreement of each with a model of the others {agreement:.3f}"
         )
         if like:
             say("two searches have come to the same poses")
