@@ -25,6 +25,7 @@ from relit.evaluate.definitions import DEFINITIONS
 from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS as DUPLICATES
 from relit.evaluate.flash import FLASH_DEFINITIONS as FLASH
 from relit.evaluate.protocols import orb, pir, samurai, sfd
+from relit.evaluate.registration import DEFINITIONS as REGISTRATION
 from relit.files import parse_toml
 from relit.viewer.page import PAGE
 from support import camera_ring
@@ -220,7 +221,7 @@ def test_definitions_page_defines_all_figures():
         == {
             name
             for some in (
-                *(DEFINITIONS, FLASH, COLLECTION, DUPLICATES),
+                *(DEFINITIONS, FLASH, COLLECTION, DUPLICATES, REGISTRATION),
                 *(each.DEFINITIONS for each in (sfd, pir, samurai, orb)),
             )
             for name in some

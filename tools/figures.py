@@ -18,12 +18,14 @@ from relit.evaluate.definitions import DEFINITIONS  # noqa: E402
 from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS  # noqa: E402
 from relit.evaluate.flash import FLASH_DEFINITIONS  # noqa: E402
 from relit.evaluate.protocols import orb, pir, samurai, sfd  # noqa: E402
+from relit.evaluate.registration import DEFINITIONS as REGISTRATION  # noqa: E402
 
 KINDS = {  # heading -> definitions
     "Shape, material and light": DEFINITIONS,
     "Photos under a flash": FLASH_DEFINITIONS,
     "Collections": COLLECTION,
     "Photos of duplicates": DUPLICATES_DEFINITIONS,
+    "Poses alone (`relit benchmark registration`)": REGISTRATION,
     "`--protocol sfd`": sfd.DEFINITIONS,
     "`--protocol pir`": pir.DEFINITIONS,
     "`--protocol samurai`": samurai.DEFINITIONS,

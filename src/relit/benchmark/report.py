@@ -47,6 +47,13 @@ KEY = {  # figures of the tables of objects and ablations: name -> head of the c
         "environment_mse": "env.",
         "chamfer": "Chamfer",
     },
+    "registration": {
+        "rotation_median": "rotation",
+        "determined": "determined %",
+        "determined_sure": "of these sure %",
+        "wrong_sure": "wrong and sure %",
+        "seconds_poses": "s",
+    },
 }
 # Figures whose definition has changed so that values before and after do not compare: the sentence
 # in a record says under which one it was measured.

@@ -329,6 +329,7 @@ REGISTRATION = Suite(
         "undetermined_unsure": (">=", 90.0),
         "wrong_sure": ("<=", 1.0),
     },
+    draft_bars={"wrong_sure": ("<=", 1.0)},
 )
 
 SUITES: dict[str, Suite] = {

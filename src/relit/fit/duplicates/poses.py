@@ -16,10 +16,9 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from relit.errors import EXIT_FAILED, UserError
 from relit.fit.duplicates.options import DuplicatesOptions
 from relit.fit.duplicates.verdict import UNCERTAIN, judge_pile_poses
-from relit.fit.registration.instances.effort import Effort
 from relit.fit.registration.instances.growth import viewing_directions
 from relit.fit.registration.instances.left_out import leave_out
-from relit.fit.registration.instances.options import Growth, Search
+from relit.fit.registration.instances.options import Effort, Growth, Search
 from relit.fit.registration.instances.trials import place_few
 from relit.fit.registration.instances.views import COARSE, InstanceView, ViewId, carved, views_of
 from relit.fit.registration.placements import Placements, Status

@@ -4,8 +4,7 @@ import numpy as np
 
 from relit.conventions import similarity
 from relit.fit.registration.instances import regrowth
-from relit.fit.registration.instances.effort import Effort
-from relit.fit.registration.instances.options import Growth, Search
+from relit.fit.registration.instances.options import Effort, Growth, Search
 from relit.fit.registration.instances.regrowth import Placed, improved
 
 

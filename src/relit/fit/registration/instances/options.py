@@ -4,10 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from relit.fit.registration.instances.effort import Effort
-
 # weights in fit.register's descriptors: decoration tells most, and of an object without it colour
 DETAILED, COLOURFUL = (0.6, 1.0, 0.1, 0.6), (0.6, 2.0, 0.1)
+
+STEPS = 100  # of a fit that counts as one model
+
+
+class Effort:
+    """Work of one search. limit: fits of STEPS steps after which nothing is begun any more that the
+    poses can do without."""
+
+    def __init__(self, limit: float = float("inf")):
+        self.limit, self.spent = limit, 0.0
+
+    def spend(self, steps: int) -> None:
+        """Count a fit of so many steps."""
+        self.spent += steps / STEPS
+
+    @property
+    def over(self) -> bool:
+        return self.spent >= self.limit
 
 
 @dataclass(frozen=True)
