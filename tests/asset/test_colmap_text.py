@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from relit.asset.colmap_text import quaternion, write_colmap
-from relit.geometry.se3 import exp_so3, look_at
+from relit.asset.colmap_text import write_colmap
+from relit.geometry.se3 import exp_so3, look_at, quaternion
 from relit.scene import Camera
 
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from relit.geometry.se3 import quaternion
 from relit.scene import Camera
 
 
@@ -36,9 +36,3 @@ def write_colmap(folder: str | Path, cameras: Sequence[tuple[str, Camera]]) -> P
     (folder / "images.txt").write_text("\n".join(images) + "\n", encoding="utf-8")
     (folder / "points3D.txt").write_text("# none\n", encoding="utf-8")
     return folder
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(4,) unit (w, x, y, z), w >= 0, of a rotation matrix (3, 3)."""
-    x, y, z, w = Rotation.from_matrix(np.asarray(rotation, np.float64)).as_quat(canonical=True)
-    return np.array([w, x, y, z])

@@ -4,6 +4,7 @@ poses are `b_from_a`."""
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from relit.conventions import similarity
 
@@ -153,3 +154,9 @@ def turns_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     turns = [x[:3, :3] @ y[:3, :3].T for x, y in zip(a, b, strict=True)]
     angles = np.array([[rotation_angle(s.T @ t) for t in turns] for s in turns])
     return angles[np.median(angles, 1).argmin()]
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(4,) unit (w, x, y, z), w >= 0, of a rotation matrix (3, 3)."""
+    turn = Rotation.from_matrix(np.asarray(rotation, np.float64))
+    return np.roll(turn.as_quat(canonical=True), 1)
