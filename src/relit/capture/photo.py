@@ -67,7 +67,7 @@ class Decoder:
             clipped = (
                 None
                 if clipped is None
-                else cv2.resize(clipped.astype(np.uint8), (w, h), interpolation=cv2.INTER_LINEAR)
+                else cv2.resize(clipped.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA)
                 > 0
             )
             normal = (

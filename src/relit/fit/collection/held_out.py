@@ -130,7 +130,8 @@ def lights_of(
 ) -> np.ndarray:
     """(N, ROWS, COLUMNS, 3) radiance of each photo's light under a finished material."""
     options, size = fit.options, maps.roughness.shape[0]
-    bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
+    ignored = [s.ignored for s in shots]
+    bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots], ignored=ignored)
     material = start_material(size, maps.base_color, 0.5, 0.0)
     material.colour = mi.Float(
         np.concatenate([maps.base_color, maps.roughness[..., None]], -1).astype(np.float32).ravel()
@@ -353,7 +354,8 @@ def refine_held_out_cameras(
 ) -> list[Camera]:
     """The cameras after a descent with the shape frozen: pose, distance, focal length and small
     lights move. longer: in `frozen_steps`."""
-    bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots])
+    ignored = [s.ignored for s in shots]
+    bank = make_bank(cameras, [s.rgb for s in shots], [s.mask for s in shots], ignored=ignored)
     bank.corrections = no_corrections(bank.views, CorrectionModel.ABOUT_ORIGIN)
     learnt, rates = start_photo_lights(np.array([s.tint for s in shots]), GREY)
     own = replace(

@@ -10,7 +10,7 @@ import numpy as np
 from relit.capture.readers.samurai import Hints, read_hints
 from relit.errors import UserError
 from relit.fit.collection.options import CollectionOptions
-from relit.fit.passes.load_photos import resize
+from relit.fit.passes.load_photos import partly_clipped, resize
 from relit.fit.registration.photos.poses import even_colours
 from relit.fit.registration.register import Crop, crop_photo
 from relit.geometry.se3 import rotation_from
@@ -27,7 +27,8 @@ class CollectionPhoto:
     """One photo, decoded. rgb: (H, W, 3) linear, mask: (H, W). camera: intrinsics by EXIF or guess,
     pose the identity.
     direction: (3,) hint, or 0. given: (4, 4) world_from_camera in the capture's own frame, where
-    hints are of given cameras, or None."""
+    hints are of given cameras, or None. ignored: (H, W) bool, pixels that tell nothing
+    (`partly_clipped`), or None."""
 
     photo: Photo
     rgb: np.ndarray
@@ -35,6 +36,7 @@ class CollectionPhoto:
     camera: Camera
     direction: np.ndarray
     given: np.ndarray | None = None
+    ignored: np.ndarray | None = None
 
     @property
     def tint(self) -> np.ndarray:
@@ -107,7 +109,15 @@ def load_shots(capture: Capture, options: CollectionOptions, run) -> PhotoSet:
         direction = np.zeros(3) if hints is None else hints.directions.get(photo.name, np.zeros(3))
         given = photo.camera.world_from_camera if of_cameras and photo.camera is not None else None
         shots.append(
-            CollectionPhoto(photo, rgb, mask, guessed_camera(photo, w, h), direction, given)
+            CollectionPhoto(
+                photo,
+                rgb,
+                mask,
+                guessed_camera(photo, w, h),
+                direction,
+                given,
+                partly_clipped(pixels, rgb),
+            )
         )
     if guessed:
         run.say(

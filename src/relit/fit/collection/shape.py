@@ -84,7 +84,8 @@ def start_of_shape(photos: PhotoSet, poses: PhotoPoses, fit: FitContext) -> Fitt
     rate."""
     options, shots, cameras = fit.options, photos.shots, poses.cameras(photos.shots)
     silhouettes = [s.mask for s in shots]
-    bank = make_bank(cameras, [s.rgb for s in shots], silhouettes)
+    ignored = [s.ignored for s in shots]
+    bank = make_bank(cameras, [s.rgb for s in shots], silhouettes, ignored=ignored)
     weights = np.ones(len(shots)) if "posterior" in options.without else poses.weights()
     bank = weighted_bank(bank, weights, fit.seed)
     nodes = volume_options(options).levels[0]

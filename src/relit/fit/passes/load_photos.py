@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from relit.conventions import move_pose
-from relit.fit.passes.pixels import PixelBank, make_bank
-from relit.scene import Camera, Capture
+from relit.fit.passes.pixels import SATURATED, PixelBank, make_bank
+from relit.scene import Camera, Capture, Pixels
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def load_pixels(capture: Capture, options, run) -> UnitPhotos:
     if shrink < 1:
         size = f"all together {options.max_pixels / 1e6:.0f} megapixels; --set max_pixels=N"
         run.say(f"photos are used at {shrink:.0%} of their size ({size})")
-    cameras, images, masks, normals, whites = [], [], [], [], []
+    cameras, images, masks, normals, whites, ignored = [], [], [], [], [], []
     for photo in capture.photos:
         pixels, camera = photo.load(), photo.camera
         rgb, mask, normal = pixels.rgb, pixels.mask, pixels.normal
@@ -42,6 +42,7 @@ def load_pixels(capture: Capture, options, run) -> UnitPhotos:
             w, h = max(16, round(camera.width * shrink)), max(16, round(camera.height * shrink))
             rgb, mask, normal = (resize(a, w, h) for a in (rgb, mask, normal))
             camera = camera.resized(w, h)
+        ignored.append(partly_clipped(pixels, rgb))
         cameras.append(camera.with_pose(move_pose(unit_from_world, camera.world_from_camera)))
         images.append(rgb)
         masks.append(mask)
@@ -61,9 +62,19 @@ def load_pixels(capture: Capture, options, run) -> UnitPhotos:
         for i, m in zip(images, masks, strict=False)
     ) / max(weight, 1e-6)
     prior = normals if any(n is not None for n in normals) else None
-    bank = make_bank(cameras, images, masks, prior, whites)
+    bank = make_bank(cameras, images, masks, prior, whites, ignored=ignored)
     names = [photo.name for photo in capture.photos]
     return UnitPhotos(bank, cameras, masks if masked else None, np.maximum(level, 1e-3), names)
+
+
+def partly_clipped(pixels: Pixels, rgb: np.ndarray) -> np.ndarray | None:
+    """(h, w) bool: pixels of a shrunken photo `rgb` (h, w, 3) of which only a part was clipped. Their
+    mean is darker than what was there, and yet no clipped value: they tell nothing. None where
+    the photo's format holds no codes."""
+    if pixels.clipped is None:
+        return None
+    share = resize(pixels.clipped.astype(np.float32), rgb.shape[1], rgb.shape[0])
+    return (share > 0) & (rgb.max(-1) < SATURATED * pixels.white)
 
 
 def resize(image, width: int, height: int):

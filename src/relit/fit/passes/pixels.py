@@ -74,12 +74,13 @@ def make_bank(
     whites=None,
     *,
     radius=1.0,
+    ignored=None,
 ) -> PixelBank:
     """cameras: unit frame. images: (H, W, 3) linear. masks: (H, W) or None each. normals: (H, W, 3)
     or None each, or None. whites: see `saturation`.
 
     Candidates: pixels whose ray meets the object sphere and, where masks are known, lie within a
-    margin of the mask.
+    margin of the mask; without those that are ignored, (H, W) bool or None each.
     """
     masked = all(m is not None for m in masks)
     sizes = [im.shape[0] * im.shape[1] for im in images]
@@ -91,6 +92,8 @@ def make_bank(
         if masked:
             grow = max(3, round(0.03 * max(h, w)))
             near &= binary_dilation(mask > 0.02, iterations=grow) if mask.any() else near
+        if ignored is not None and ignored[k] is not None:
+            near &= ~ignored[k]
         candidates.append(np.flatnonzero(near.ravel()).astype(np.uint32) + offsets[k])
         alpha = np.ones((h, w), np.float32) if mask is None else mask
         rgbm.append(np.concatenate([image, alpha[..., None]], -1).reshape(-1))
