@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from relit import images
-from relit.capture import open as opening
+from relit.capture import mask_sources
 from relit.capture.frames import parse_json_file
 from relit.capture.open import open_capture
 from relit.capture.readers.middlebury import parse
@@ -208,7 +208,7 @@ def test_a_mask_of_another_shape(capture_folder):
 
 
 def test_a_photo_with_an_empty_mask_is_left_out_with_a_note(capture_folder, cameras, monkeypatch):
-    monkeypatch.setattr(opening, "SMALL", 40)  # masks are judged on small copies
+    monkeypatch.setattr(mask_sources, "SMALL", 40)  # masks are judged on small copies
     for i, camera in enumerate(cameras):
         images.write_data(
             _made(capture_folder / "masks") / f"{i:03d}.png",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,21 +11,11 @@ import numpy as np
 from relit.errors import EXIT_USAGE, UserError
 from relit.geometry.lens import Lens
 from relit.geometry.se3 import nearest_rotation
-from relit.images import EXTENSIONS
 from relit.masks.rle import Runs
 from relit.scene import Camera, Sphere
 
 MAX_TEXT = 256 * 2**20  # bytes of a camera file; larger ones are not camera files
 LEAST_SIDE = 16  # pixels that --max-side may ask for
-IMAGE_FOLDERS = ("images", "image", "rgb", "input", "photos")
-NOT_PHOTOS = (
-    "_mask",
-    ".mask",
-    "_normal",
-    "_depth",
-    "_alpha",
-    "_seg",
-)  # ends of the stems of files that lie beside the photos
 
 
 @dataclass(frozen=True)
@@ -65,24 +54,6 @@ class Reading:
     kind: str = ""
 
 
-def list_images(folder: Path) -> list[Path]:
-    """Photos directly in a folder, sorted by name; masks, normals and hidden files left out."""
-    if not folder.is_dir():
-        return []
-    files = (
-        f
-        for f in folder.iterdir()
-        if f.suffix.lower() in EXTENSIONS and not f.name.startswith(".") and f.is_file()
-    )
-    return sorted(f for f in files if not f.stem.lower().endswith(NOT_PHOTOS))
-
-
-def image_folder(root: Path) -> Path | None:
-    """The folder of the photos of a capture: images/, image/, ... or the root itself; None when
-    none holds a photo."""
-    return next((d for d in (*(root / n for n in IMAGE_FOLDERS), root) if list_images(d)), None)
-
-
 def check_max_side(max_side: int | None) -> None:
     """Raises UserError (code 2) for a size at which nothing is left of a photo."""
     if max_side is not None and max_side < LEAST_SIDE:
@@ -93,19 +64,6 @@ def check_max_side(max_side: int | None) -> None:
             "use --max-side 800, or leave it out",
             code=EXIT_USAGE,
         )
-
-
-def path_inside(root: Path, name: str, source: Path) -> Path:
-    """root / name, refused when it leaves `root`. `source` is the file that names it."""
-    name = name.replace("\\", "/")
-    target = Path(os.path.normpath(root / name))
-    if "\0" in name or not target.is_relative_to(Path(os.path.normpath(root))):
-        raise UserError(
-            f"a camera file names an image outside the capture: '{name[:200]}'",
-            "paths must stay inside the folder that is opened, so that a capture can be moved and shared",
-            f"put the images under the capture's folder and make the paths relative: {source}",
-        )
-    return target
 
 
 def read_text(path: Path) -> str:

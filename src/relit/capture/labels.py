@@ -8,10 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from relit.capture.annotations import draw_outlines, outlines_of
 from relit.capture.frames import parse_json_file
+from relit.capture.listing import pictures_in
+from relit.capture.photo import upright_mask
 from relit.errors import UserError
+from relit.images import read_header
 from relit.images.opencv import decode_file
-from relit.masks.rle import runs_from
 
 LEAST_SIDE = 24  # pixels; smaller objects carry no pose
 MOST = 1000  # objects
@@ -24,9 +27,9 @@ def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray
     if source.name == BOP_TRUTH:
         return _from_bop(source, photo, shape)
     if source.is_dir():
-        return _from_cutouts(source, shape)
+        return _from_cutouts(source, photo, shape)
     if source.suffix.lower() == ".json":
-        return _from_coco(source, photo, shape)
+        return draw_outlines(outlines_of(source, photo), photo, shape)
     data = decode_file(source, cv2.IMREAD_UNCHANGED)
     if data is None:
         raise UserError(
@@ -34,7 +37,7 @@ def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray
             "it is damaged or no picture",
             f"write it again: {source}",
         )
-    labels = _numbers(data)
+    labels = upright_mask(_numbers(data), shape, read_header(photo).orientation)
     if labels.shape != shape:
         if (
             abs(labels.shape[1] / labels.shape[0] - shape[1] / shape[0])
@@ -58,10 +61,17 @@ def _numbers(data: np.ndarray) -> np.ndarray:
     return data.astype(np.int32)
 
 
-def _from_cutouts(folder: Path, shape: tuple[int, int]) -> np.ndarray:
-    labels = np.zeros(shape, np.int32)
-    for k, file in enumerate(sorted(folder.glob("*.png")), 1):
+def cutouts_in(folder: Path) -> list[Path]:
+    """The cut-outs in a folder, hidden files left out."""
+    return [f for f in pictures_in(folder) if f.suffix.lower() == ".png"]
+
+
+def _from_cutouts(folder: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
+    labels, turn = np.zeros(shape, np.int32), read_header(photo).orientation
+    for k, file in enumerate(cutouts_in(folder), 1):
         data = decode_file(file, cv2.IMREAD_UNCHANGED)
+        if data is not None:
+            data = upright_mask(data, shape, turn)
         if data is None or data.ndim != 3 or data.shape[2] != 4 or data.shape[:2] != shape:
             have = (
                 "unreadable"
@@ -125,93 +135,14 @@ def which_objects(source: Path, photo: Path) -> str | None:
         return f"the objects are those with obj_id {bop_object(parse_json_file(source))}, the commonest of the scene"
     if source.suffix.lower() != ".json":
         return None
-    data = parse_json_file(source)
-    if (chosen := _coco_category(data, photo)) is None:
+    kind = outlines_of(source, photo).kind
+    if kind is None:
         return None
-    listed = data.get("categories")
-    listed = listed if isinstance(listed, list) else []
-    names = {
-        c["id"]: c.get("name")
-        for c in listed
-        if isinstance(c, dict) and isinstance(c.get("id"), int)
-    }
-    return f"the objects are those of category {names.get(chosen, chosen)}, the commonest; others are left out"
+    return f"the objects are those of category {kind}, the commonest; others are left out"
 
 
 def _commonest(kinds: list):
     return max(sorted(set(kinds)), key=kinds.count)
-
-
-def _coco_category(data: dict, photo: Path) -> int | None:
-    """Of several categories the one with the most objects in the photos that lie in the photo's
-    folder; None where all objects count: there is but one, or each object has one of its own. What
-    says that it is a group (iscrowd) is an object too: many tools write it of whatever has run
-    lengths."""
-    images = [i for i in data["images"] if isinstance(i, dict)]
-    names = {f.name for f in photo.parent.iterdir()}
-    here = [i for i in images if Path(str(i.get("file_name", ""))).name in names] or images
-    ids = {str(i.get("id")) for i in here}
-    kinds = [
-        _coco_kind(a)
-        for a in data["annotations"]
-        if isinstance(a, dict) and str(a.get("image_id")) in ids
-    ]
-    if len(set(kinds)) < 2 or len(set(kinds)) == len(kinds):
-        return None
-    return _commonest(kinds)
-
-
-def _coco_kind(annotation: dict) -> int:
-    """-1 where none is told."""
-    kind = annotation.get("category_id")
-    return kind if isinstance(kind, int) else -1
-
-
-def _from_coco(file: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Objects of the commonest category."""
-    data = parse_json_file(file)
-    images = [i for i in data["images"] if isinstance(i, dict)]
-    entry = next((i for i in images if Path(str(i.get("file_name", ""))).name == photo.name), None)
-    if entry is None and len(images) == 1:
-        entry = images[0]
-    if entry is None:
-        raise UserError(
-            f"the annotations do not name the photo {photo.name}", fix=f"check `images`: {file}"
-        )
-    size = [entry.get("height", shape[0]), entry.get("width", shape[1])]
-    if not all(isinstance(v, (int, float)) and 1 <= v < 1e6 for v in size):
-        raise UserError(
-            f"the annotations give the photo {photo.name} the size {size}",
-            fix=f"check `images`: {file}",
-        )
-    sx, sy = shape[1] / size[1], shape[0] / size[0]
-    labels, k = np.zeros(shape, np.int32), 0
-    chosen = _coco_category(data, photo)
-    for a in data["annotations"]:
-        if (
-            not isinstance(a, dict)
-            or a.get("image_id") != entry.get("id")
-            or chosen not in (None, _coco_kind(a))
-        ):
-            continue
-        k += 1
-        s = a.get("segmentation")
-        try:
-            if isinstance(s, dict):
-                mask = runs_from(s, f"annotation {k}").decode()
-                labels[cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = k
-            else:
-                polygons = [np.round(np.array(p, np.float64).reshape(-1, 2) * (sx, sy)) for p in s]
-                if not all((np.abs(p) < 1e6).all() for p in polygons):
-                    raise ValueError("corners far outside the photo")
-                cv2.fillPoly(labels, [p.astype(np.int32) for p in polygons], k)
-        except (TypeError, ValueError, KeyError, OverflowError, cv2.error) as error:
-            raise UserError(
-                f"annotation {k} has no usable segmentation",
-                str(error),
-                f"polygons or run lengths: {file}",
-            ) from None
-    return labels
 
 
 def checked_labels(labels: np.ndarray, source: Path) -> tuple[np.ndarray, list[str]]:

@@ -6,7 +6,6 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from relit.capture import photo
@@ -17,6 +16,14 @@ from relit.capture.corrections import (
     with_corrected_masks,
 )
 from relit.capture.frames import Frame, Reading, check_max_side
+from relit.capture.listing import (
+    FRAMES_OF_VIDEO,
+    IMAGE_FOLDERS,
+    VIDEOS,
+    passed_over,
+    what_lies_there,
+)
+from relit.capture.mask_sources import masked, with_decoder
 from relit.capture.readers import (
     colmap_model,
     idr,
@@ -31,11 +38,8 @@ from relit.capture.readers import (
 from relit.capture.sphere import SphereView, check_sphere, settled_sphere, up_direction
 from relit.errors import UserError, did_you_mean
 from relit.geometry.lens import lens_of
-from relit.images import Header, Image, read_small
-from relit.masks.files import find_mask, index_masks, judge, read_counted
+from relit.images import Header
 from relit.masks.grabcut import grabcut
-from relit.masks.segment import segmenter
-from relit.masks.threshold import Backdrop, find_backdrop
 from relit.scene import Capture, Photo, Sphere
 
 # In this order; the first that recognises the folder reads it. A reader has LOOKED_FOR,
@@ -53,8 +57,11 @@ READERS = {
     "photos": photo,
 }
 MASKS = ("auto", "none", "alpha", "files", "threshold", "grabcut", "segment")
-SMALL = 256  # pixels, longest side of the copies that masks are judged on
-LOOKED_AT = 12  # photos that are looked at for a plain backdrop
+KINDS_OF_FILES = {  # extension -> what a file given in the place of a folder is, what to do
+    **{v: ("a video", FRAMES_OF_VIDEO) for v in VIDEOS},
+    **{z: ("an archive", "unpack it and give its folder") for z in (".zip", ".rar", ".7z", ".tar")},
+}
+MOST_LENSES = 4  # focal lengths by EXIF that are named; more are a zoom that was turned
 
 
 def open_capture(
@@ -91,12 +98,13 @@ def open_capture(
     if isinstance(reading, sfd.Source):
         return sfd.open_duplicates(reading, focal=focal, max_side=max_side)
     headers = photo.headers_of(reading.frames)
-    notes = list(reading.notes) + _size_notes(reading, headers)
+    notes = [*reading.notes, *_size_notes(reading, headers)]
+    notes += [*_lens_notes(reading, headers), *photo.camera_notes(reading.frames, headers)]
     training = sum(not f.held_out for f in reading.frames)
     if training < min_photos:
         raise UserError(
             f"{training} photo{'s are' if training != 1 else ' is'} not enough: at least {min_photos} are needed",
-            "shape is found by comparing photos from different sides",
+            "shape is found by comparing photos from different sides" + _lying_there(reading),
             f"add photos, 30 to 80 all around the object are good: {reading.root}",
         )
     normals = photo.index_normals(reading.root)
@@ -107,7 +115,8 @@ def open_capture(
     photos = _with_facing_normals(photos, notes)
     if any(p.load.normal for p in photos):
         notes.append(f"{sum(p.load.normal is not None for p in photos)} photos have normal priors")
-    photos, small, dark = _masked(reading, headers, photos, masks, notes)
+    photos, small, dark = masked(reading, headers, photos, masks, notes)
+    notes += passed_over(reading.root, _files_of(reading, photos), _cameras_of(reading))
     corrected = set() if masks == "none" else set(corrected_masks(reading.root))
     empty = {
         i
@@ -186,6 +195,17 @@ def with_grabcut(capture: Capture) -> Capture:
     return replace(capture, photos=photos, held_out=held, notes=(*capture.notes, note))
 
 
+def _files_of(reading: Reading, photos: list[Photo]) -> list[Path]:
+    """The files of the photos and of their masks."""
+    masks = [f.mask for f in reading.frames] + [getattr(p.load, "mask", None) for p in photos]
+    return [f.path for f in reading.frames] + [m for m in masks if isinstance(m, Path)]
+
+
+def _cameras_of(reading: Reading) -> str:
+    """The format's name where the photos have cameras, else ''."""
+    return reading.format if any(f.camera is not None for f in reading.frames) else ""
+
+
 def _is_corrected(p: Photo) -> bool:
     """Whether the mask was corrected by hand, be the photo undistorted since or not."""
     return any(isinstance(layer, Corrected) for layer in photo.layers(p.load))
@@ -208,7 +228,7 @@ def _with_facing_normals(photos: list[Photo], notes: list[str]) -> list[Photo]:
         f"the normal priors are not used: {100 * (1 - facing.mean()):.0f} % of them look away from the camera; they must be in its axes, "
         "x right, y down, z forward (docs/formats.md)"
     )
-    return [_with(p, normal=None) for p in photos]
+    return [with_decoder(p, normal=None) for p in photos]
 
 
 def with_calibration(p: Photo, frame: Frame) -> Photo:
@@ -224,20 +244,65 @@ def _read(path: Path, labels: bool) -> Reading | sfd.Source:
             continue
         found = module.recognise(path)
         if found is not None:
-            return module.read(path, found)
+            reading = module.read(path, found)
+            return _of_project(path, reading) if name == "photos" else reading
     looked = "; ".join(m.LOOKED_FOR for m in READERS.values())
+    if path.is_file() and (kind := KINDS_OF_FILES.get(path.suffix.lower())):
+        raise UserError(
+            f"the input is {kind[0]}", "a folder of photos is expected", f"{kind[1]}: {path}"
+        )
     if path.is_file():
         raise UserError(
             "the input is no capture",
             f"a folder is expected, or one of its camera files; looked for {looked}",
             f"give the folder of: {path}",
         )
-    some = sorted(p.name + ("/" if p.is_dir() else "") for p in path.iterdir())[:8]
     raise UserError(
         "no images were found",
-        f"looked for {looked}; the folder holds {', '.join(some) if some else 'nothing'}",
-        f"give the folder that holds the photos: {path}",
+        f"{what_lies_there(path)}. Looked for {looked}",
+        "give the folder that holds the photos; those of several folders belong into one "
+        f"images/: {path}",
     )
+
+
+def _lying_there(reading: Reading) -> str:
+    """What else the folder holds, for the message that photos are too few."""
+    said = what_lies_there(reading.root) if reading.root.is_dir() else ""
+    return f"; {said}" if said and not said.startswith("the folder holds") else ""
+
+
+def _of_project(path: Path, reading: Reading) -> Reading:
+    """The reading of the folder above, where `path` is its images/ and it knows the cameras of
+    these photos; else the reading as it is."""
+    if path.name.lower() not in IMAGE_FOLDERS:
+        return reading
+    cameras = [m for n, m in READERS.items() if n not in ("duplicates", "photos")]
+    for module in cameras:
+        found = module.recognise(path.parent)
+        if found is None:
+            continue
+        above = module.read(path.parent, found)
+        if above.frames and all(f.path.is_relative_to(path) for f in above.frames):
+            note = f"the {above.format} cameras of the folder above are used: {found}"
+            return replace(above, notes=(*above.notes, note))
+        break
+    return reading
+
+
+def _lens_notes(reading: Reading, headers: list[Header]) -> list[str]:
+    """A note where photos of one size without cameras were taken with several focal lengths."""
+    focal: dict[tuple[int, int], Counter] = {}
+    for frame, header in zip(reading.frames, headers, strict=True):
+        if header.focal is not None and frame.camera is None:
+            size = (header.width, header.height)
+            focal.setdefault(size, Counter())[round(header.focal)] += 1
+    return [
+        f"the photos of {w} x {h} pixels have {len(counts)} focal lengths by EXIF ("
+        + ", ".join(f"{n} of {f} pixels" for f, n in counts.most_common(MOST_LENSES))
+        + "): each gets its own camera"
+        for (w, h), counts in focal.items()
+        if 1 < len(counts) <= MOST_LENSES
+    ]
 
 
 def _size_notes(reading: Reading, headers: list[Header]) -> list[str]:
@@ -250,190 +315,3 @@ def _size_notes(reading: Reading, headers: list[Header]) -> list[str]:
         f"the photos have {len(sizes)} sizes ({text}): "
         + ("each has its own camera" if has_cameras else "each size gets its own focal length")
     ]
-
-
-# ---------------------------------------------------------------- masks
-
-
-def _masked(
-    reading: Reading, headers: list[Header], photos: list[Photo], wanted: str, notes: list[str]
-):
-    """-> (photos that know their masks, small masks (h, w) or None, True when the background is
-    black)."""
-    none = [None] * len(photos)
-    if wanted in ("auto", "alpha") and all(h.alpha for h in headers):
-        small = [
-            None if f.held_out else _small(p).alpha
-            for f, p in zip(reading.frames, photos, strict=True)
-        ]
-        if wanted == "alpha" or any((a < 0.5).any() for a in small if a is not None):
-            inverted, empty = judge(_named(reading, small), "the alpha channel")
-            if inverted:
-                why = "it is opaque at the border and clear in the middle"
-                raise UserError(
-                    "the alpha channel looks inverted", why, "invert it, or use --masks none"
-                )
-            _say_empty(empty, notes)
-            notes.append("masks come from the alpha channel; the photos are composited on black")
-            return [_with(p, mask=True) for p in photos], small, True
-        notes.append("the alpha channel is opaque everywhere: it is no mask")
-    elif wanted == "alpha":
-        raise UserError(
-            f"{sum(not h.alpha for h in headers)} of {len(headers)} photos have no alpha channel",
-            fix="give mask files, or another kind of masks",
-        )
-    elif any(h.alpha for h in headers):
-        notes.append(
-            f"only {sum(h.alpha for h in headers)} of {len(headers)} photos have an alpha channel: it is not used as a mask"
-        )
-    if wanted in ("auto", "files") and any(f.runs for f in reading.frames):
-        return (*_from_runs(reading, photos, notes), False)
-    if wanted in ("auto", "files"):
-        result = _from_files(reading, photos, wanted == "files", notes)
-        if result is not None:
-            return result
-    if wanted in ("auto", "threshold"):
-        result = _from_backdrop(reading, photos, wanted == "threshold", notes)
-        if result is not None:
-            return result
-    if wanted.startswith("segment"):
-        mask_of = segmenter(*wanted.split(":", 1)[1:])
-        masked, small = [], []
-        for p in photos:
-            m = mask_of(p.load().rgb)
-            masked.append(photo.with_mask(p, m))
-            scale = min(1.0, SMALL / max(m.shape))
-            small.append(cv2.resize(m, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-        _say_empty(judge(_named(reading, small), "the segmenter")[1], notes)
-        notes.append("masks were found by the segmenter; look at them")
-        return masked, small, False
-    return photos, none, False
-
-
-def _named(reading: Reading, small: list) -> dict[str, np.ndarray]:
-    return {f.name: m for f, m in zip(reading.frames, small, strict=True) if m is not None}
-
-
-def _small(p: Photo) -> Image:
-    return read_small(p.load.path, SMALL, p.load.upright)
-
-
-def _with(p: Photo, **changes) -> Photo:
-    return replace(p, load=replace(p.load, **changes))  # pyright: ignore[reportArgumentType]
-
-
-def _say_empty(empty: list[str], notes: list[str]) -> None:
-    if empty:
-        notes.append(
-            f"{len(empty)} photos have an empty mask and are not used, for example {empty[0]}"
-        )
-
-
-def _from_runs(reading: Reading, photos: list[Photo], notes: list[str]):
-    """(photos, small masks) of a format that holds its masks itself."""
-    lacking = [f.name for f in reading.frames if f.runs is None]
-    if lacking:
-        what = f"{len(lacking)} of {len(photos)} photos have no mask in the file, for example {lacking[0]}"
-        raise UserError(what, fix=f"add their run lengths, or use --masks none: {reading.root}")
-    masked = [_with(p, mask=f.runs) for p, f in zip(photos, reading.frames, strict=True)]
-    small = [
-        _shrunk(photo.fitted_mask(f.runs.decode(), (p.height, p.width), p.load.orientation, f.name))
-        for p, f in zip(photos, reading.frames, strict=True)
-    ]
-    _say_empty(judge(_named(reading, small), "the run lengths")[1], notes)
-    notes.append("masks come from run lengths")
-    return masked, small
-
-
-def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
-    folder, index = index_masks(reading.root)
-    named = any(f.mask is not None for f in reading.frames)
-    files = [
-        f.mask
-        if f.mask is not None and f.mask.is_file()
-        else find_mask(f.path, reading.root, index)
-        for f in reading.frames
-    ]
-    missing = [
-        f.name for f, m in zip(reading.frames, files, strict=True) if m is None or not m.is_file()
-    ]
-    train = [f.name for f in reading.frames if not f.held_out]
-    if folder is None and not asked and not named and len(missing) == len(files):
-        return None
-    if set(missing) & set(train):
-        lacking = [n for n in missing if n in set(train)]
-        raise UserError(
-            f"{len(lacking)} of {len(train)} photos have no mask, for example {lacking[0]}",
-            f"masks were looked for in {folder.name}/ by the photos' names"
-            if folder
-            else "no mask folder was found and no file ends in _mask.png",
-            f"add the masks, or use --masks none: {folder or reading.root}",
-        )
-    looked = [
-        (None, False) if f.held_out else _small_mask(m, p)  # pyright: ignore[reportArgumentType]
-        for f, m, p in zip(reading.frames, files, photos, strict=True)
-    ]
-    small = [mask for mask, _ in looked]
-    where = f"{folder.name}/" if folder else "the mask files"
-    inverted, empty = judge(_named(reading, small), where)
-    small = [1.0 - m if inverted and m is not None else m for m in small]
-    notes.append(f"masks come from {where}")
-    if any(numbered for _, numbered in looked):
-        notes.append(
-            "the masks hold the numbers 0 and 1 in the place of black and white: 1 is taken for the object"
-        )
-    if inverted:
-        notes.append("the masks were white off the object and have been inverted")
-    _say_empty(empty, notes)
-    files = [
-        m if m is not None and m.is_file() else None for m in files
-    ]  # of a held-out photo it may be missing
-    return (
-        [_with(p, mask=m, invert=inverted) for p, m in zip(photos, files, strict=True)],
-        small,
-        False,
-    )
-
-
-def _small_mask(path: Path, p: Photo) -> tuple[np.ndarray, bool]:
-    """Small copy of a mask file, and whether it holds the numbers 0 and 1 (`read_counted`)."""
-    mask, numbered = read_counted(path)
-    return _shrunk(photo.upright_mask(mask, (p.height, p.width), p.load.orientation)), numbered
-
-
-def _shrunk(mask: np.ndarray) -> np.ndarray:
-    h, w = mask.shape
-    s = min(1.0, SMALL / max(h, w))
-    return (
-        mask
-        if s == 1
-        else cv2.resize(
-            mask, (max(1, round(w * s)), max(1, round(h * s))), interpolation=cv2.INTER_AREA
-        )
-    )
-
-
-def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
-    training = [p for f, p in zip(reading.frames, photos, strict=True) if not f.held_out]
-    looked = [_small(p).rgb for p in training[:: max(1, len(training) // LOOKED_AT)]]
-    backdrop: Backdrop | None = find_backdrop(looked)
-    if backdrop is None:
-        if asked:
-            raise UserError(
-                "the photos do not stand before a plain backdrop",
-                "their borders are not of one colour",
-                "give mask files, or use --masks none to fit the background as well",
-            )
-        return None
-    small = [
-        None if f.held_out else backdrop(_small(p).rgb)
-        for f, p in zip(reading.frames, photos, strict=True)
-    ]
-    _, empty = judge(_named(reading, small), "the threshold")
-    _say_empty(empty, notes)
-    kind = "dark" if backdrop.dark else "plain"
-    notes.append(
-        f"masks were found by a threshold before the {kind} backdrop"
-        + ("; what lies outside them is set to black" if backdrop.dark else "")
-    )
-    return [_with(p, mask=backdrop) for p in photos], small, backdrop.dark

@@ -12,16 +12,28 @@ from typing import Any
 import cv2
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, image_folder, list_images
+from relit.capture.frames import Frame, Reading
+from relit.capture.listing import (
+    IMAGE_FOLDERS,
+    camera_traces,
+    image_folder,
+    image_folders,
+    is_mask_folder,
+    list_images,
+    listed,
+)
+from relit.capture.names import files_below, is_hidden
 from relit.errors import UserError
 from relit.geometry.lens import Lens, lens_of, undistorted_camera, undistortion_map
-from relit.images import EXTENSIONS, RAW, Header, read_data, read_header, read_image, turn_upright
+from relit.images import EXTENSIONS, Header, read_data, read_header, read_image, turn_upright
 from relit.masks.files import read_mask
 from relit.masks.rle import Runs
 from relit.masks.threshold import Backdrop
 from relit.scene import Camera, Photo, Pixels
 
 NORMAL_FOLDERS = ("normals", "normal")
+SAME_SHAPE = 0.02  # largest relative difference of width / height between a camera and its photo
+MOST_ROUNDING = 2.0  # pixels by which rounding changes a side of a resized copy
 
 
 @dataclass(frozen=True)
@@ -183,21 +195,8 @@ def photo_from(
 ) -> Photo:
     """A `Photo` without camera or mask. Raises UserError when camera and file have different
     shapes."""
-    w, h, upright = header.width, header.height, True
-    camera = frame.camera
-    if camera is not None and abs(camera.width / camera.height - w / h) > 0.02 * (w / h):
-        if header.turned and abs(camera.width / camera.height - h / w) < 0.02 * (h / w):
-            w, h, upright = (
-                h,
-                w,
-                False,
-            )  # calibrated on the picture as stored, before EXIF turned it
-        else:
-            raise UserError(
-                f"camera and photo have different shapes: {camera.width} x {camera.height} and {w} x {h} pixels ('{frame.name}')",
-                "the photo was cropped or turned after the cameras were found, or one set of intrinsics is used for photos of mixed sizes",
-                f"use the photos that the cameras were made for: {frame.path}",
-            )
+    upright = is_upright(frame, header)
+    w, h = (header.width, header.height) if upright else header.as_stored
     if max_side is not None and max(w, h) > max_side:
         s = max_side / max(w, h)
         size = (max(1, round(w * s)), max(1, round(h * s)))
@@ -212,6 +211,59 @@ def photo_from(
     )
     decoder = Decoder(frame.path, size, upright, normal=normal, orientation=orientation)
     return Photo(frame.name, decoder, *size, focal_hint=focal, flash_energy=frame.flash_energy)
+
+
+def is_upright(frame: Frame, header: Header) -> bool:
+    """Whether EXIF's orientation is applied to a photo: always where it has no camera. The formats
+    of known cameras mean the pixels as stored (COLMAP, nerfstudio and instant-ngp read them so);
+    the upright picture is meant where only its shape is the camera's. Raises UserError when camera
+    and photo have different shapes."""
+    camera = frame.camera
+    if camera is None:
+        return True
+    shape = camera.width / camera.height
+    w, h = header.as_stored
+    if abs(shape - w / h) <= SAME_SHAPE * (w / h):
+        return header.orientation == 1
+    if header.turned and abs(shape - h / w) <= SAME_SHAPE * (h / w):
+        return True
+    raise UserError(
+        f"camera and photo have different shapes: {camera.width} x {camera.height} and {w} x {h} "
+        f"pixels ('{frame.name}')",
+        "the photo was cropped, turned or undistorted after the cameras were found, or one set of "
+        "intrinsics is used for photos of mixed sizes",
+        f"use the photos that the cameras were made for: {frame.path}",
+    )
+
+
+def camera_notes(frames: tuple[Frame, ...], headers: list[Header]) -> list[str]:
+    """Notes on photos with cameras: whose EXIF orientation is not applied, and whose size is that
+    of no resized copy of the calibrated picture (a crop, or a picture undistorted since)."""
+    kept, odd = [], []
+    for frame, header in zip(frames, headers, strict=True):
+        if frame.camera is None:
+            continue
+        upright = is_upright(frame, header)
+        if header.orientation != 1 and not upright:
+            kept.append(frame.name)
+        w, h = (header.width, header.height) if upright else header.as_stored
+        off = abs(w - h * frame.camera.width / frame.camera.height)
+        if off > MOST_ROUNDING * max(1.0, w / h):
+            odd.append((frame, w, h))
+    notes = []
+    if kept:
+        notes.append(
+            f"{len(kept)} photos carry an EXIF orientation that is not applied, for example "
+            f"{kept[0]}: the cameras belong to the pixels as stored"
+        )
+    if odd:
+        frame, w, h = odd[0]
+        notes.append(
+            f"{len(odd)} photos have not quite the shape of their camera, for example {frame.name} "
+            f"with {w} x {h} beside {frame.camera.width} x {frame.camera.height} pixels: they may "
+            "be cropped or undistorted copies, to which these cameras do not belong"
+        )
+    return notes
 
 
 # ---------------------------------------------------------------- masks and normals from files
@@ -252,7 +304,7 @@ def index_normals(root: Path) -> dict[str, Path]:
         if folder.is_dir():
             return {
                 f.stem.removesuffix("_normal"): f
-                for f in sorted(folder.rglob("*"))
+                for f in files_below(folder)
                 if f.suffix.lower() in EXTENSIONS
             }
     return {}
@@ -310,25 +362,30 @@ LOOKED_FOR = "photos in the folder itself or in images/, image/, rgb/, input/ or
 
 
 def recognise(path: Path) -> Path | None:
-    """The folder with the photos, or None."""
-    return image_folder(path) if path.is_dir() else None
+    """The folder with the photos, or None: an images/ whose photos lie in sub-folders, one for
+    each ring or camera, as well."""
+    if not path.is_dir():
+        return None
+    inside = [d for d in image_folders(path) if d != path and in_rings(d)]
+    return image_folder(path) or next(iter(inside), None)
+
+
+def in_rings(folder: Path) -> list[Path]:
+    """The photos of all sub-folders of an images/, sorted; none for a folder of another name."""
+    if folder.name.lower() not in IMAGE_FOLDERS:
+        return []
+    inside = sorted(d for d in folder.iterdir() if d.is_dir() and not is_hidden(d))
+    return [f for d in inside if not is_mask_folder(d) for f in list_images(d)]
 
 
 def read(path: Path, found: Path) -> Reading:
-    """All photos of a folder, without cameras. Of a camera that writes two files of every photo the
-    developed one is taken."""
-    files = list_images(found)
-    developed = {f.stem for f in files if f.suffix.lower() not in RAW}
-    kept = [f for f in files if f.suffix.lower() not in RAW or f.stem not in developed]
-    twins = len(files) - len(kept)
-    notes = (
-        (f"{twins} RAW files lie beside a developed photo of the same name and are left out",)
-        if twins
-        else ()
+    """All photos of a folder, without cameras; one file of each (`capture.listing`)."""
+    listing = listed(found, duplicates=True)
+    files = listing.photos or tuple(in_rings(found))
+    frames = tuple(
+        Frame(f, f.relative_to(path).as_posix(), mask=listing.masks.get(f)) for f in files
     )
-    return Reading(
-        "photos", path, tuple(Frame(f, f.relative_to(path).as_posix()) for f in kept), notes=notes
-    )
+    return Reading("photos", path, frames, notes=(*listing.notes, *camera_traces(path)))
 
 
 def headers_of(frames: tuple[Frame, ...]) -> list[Header]:

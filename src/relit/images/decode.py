@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import struct
+import threading
 import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,17 +13,49 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image as PilImage
-from PIL import ImageCms, TiffImagePlugin, UnidentifiedImageError
+from PIL import TiffImagePlugin, UnidentifiedImageError
 
 from relit.errors import UserError
+from relit.images.profiles import Profile, profile_of, rgb_of
 
 MAX_PIXELS = 200_000_000  # larger files are refused before they are decoded
-HEIC = {".heic", ".heif"}
+HEIC = {".heic", ".heif", ".hif"}
+DELIVERY = {".webp", ".avif"}  # what web sites send in the place of JPEG
 RAW = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".rw2", ".raf"}
 FLOAT = {".exr", ".hdr"}
-CODED = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"}
+CODED = {".png", ".jpg", ".jpeg", ".jfif", ".jpe", ".bmp", ".tif", ".tiff"} | DELIVERY
 FLOATING = 3  # TIFF's sample format
+PLANE_TAGS = (0x0100, 0x0101, 0x0103, 0x0116, 0x013D, 0x0142, 0x0143)  # size, compression, tiles
+STRIP_TAGS = (0x0111, 0x0117, 0x0144, 0x0145)  # offsets and byte counts of strips, of tiles
 EXTENSIONS = CODED | FLOAT | HEIC | RAW
+
+
+BRANDS = {b"avif": "AVIF", b"avis": "AVIF"} | {
+    b: "HEIC" for b in (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"heif")
+}  # of ISO base media files
+MAGIC = (
+    (b"\xff\xd8\xff", "picture"),
+    (b"\x89PNG", "picture"),
+    (b"II*\0", "picture"),
+    (b"MM\0*", "picture"),
+    (b"II+\0", "picture"),
+    (b"BM", "picture"),
+    (b"RIFF", "picture"),
+    (b"\x76\x2f\x31\x01", "an EXR file"),
+    (b"#?RADIANCE", "a Radiance HDR file"),
+    (b"GIF8", "a GIF file"),
+    (b"\xff\x0a", "a JPEG XL file"),
+    (b"\0\0\0\x0cJXL ", "a JPEG XL file"),
+    (b"\0\0\0\x0cjP", "a JPEG 2000 file"),
+    (b"8BPS", "a Photoshop file"),
+    (b"%PDF", "a PDF file"),
+    (b"PK\3\4", "a ZIP archive"),
+    (b"\0\5\x16\7", "the attributes of a file of a Mac (AppleDouble)"),
+    (b"version https://git-lfs", "a pointer of Git LFS (run: git lfs pull)"),
+    (b"<?xml", "an XML file"),
+    (b"<svg", "an SVG drawing"),
+)
+_UNLIMITED = threading.Lock()  # Pillow's own limit is one for all threads
 
 
 def checked(path: Path) -> str:
@@ -50,12 +83,21 @@ def _too_large(path: Path, width: int, height: int) -> None:
         )
 
 
-def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.ndarray, bool]:
-    """-> ((H, W[, C]) uint8, uint16 or float32 array, True when it is linear already). colours:
-    apply the file's colour profile."""
+@dataclass(frozen=True)
+class Decoded:
+    """codes: (H, W[, C]) uint8, uint16 or float32. linear: they are linear already. profile: what
+    the colours' codes mean, or None for sRGB."""
+
+    codes: np.ndarray
+    linear: bool
+    profile: Profile | None = None
+
+
+def decode(path: Path, upright: bool = True) -> Decoded:
+    """The picture in a file. Raises UserError for what cannot be read."""
     suffix = checked(path)
     if suffix == ".exr":
-        return _finite(exr(path)[0], path), True  # pyright: ignore[reportArgumentType]
+        return Decoded(_finite(exr(path)[0], path), True)  # pyright: ignore[reportArgumentType]
     if suffix == ".hdr":
         import cv2
 
@@ -65,67 +107,55 @@ def decode(path: Path, upright: bool = True, colours: bool = True) -> tuple[np.n
         array = decode_file(path, cv2.IMREAD_UNCHANGED)
         if array is None:
             raise broken(path, "not a Radiance HDR file")
-        return _finite(np.ascontiguousarray(array[..., ::-1]), path), True
+        return Decoded(_finite(np.ascontiguousarray(array[..., ::-1]), path), True)
     if suffix in RAW:
         flip = {} if upright else {"user_flip": 0}
         with raw_file(path) as raw:  # camera white balance, no automatic exposure, linear
-            return raw.postprocess(
+            developed = raw.postprocess(
                 gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, **flip
-            ), True
+            )
+        return Decoded(developed, True)
     floats = float_tiff(path)
     if floats is not None:
-        return _finite(_float_colours(path, floats.orientation if upright else 1), path), True
+        array = _float_colours(path, floats.orientation if upright else 1)
+        return Decoded(_finite(array, path), True)
     with pil(path) as image:
         try:
-            orientation = orientation_of(image) if upright else 1
-            if _is_sixteen_bit(path, suffix):
-                array = _sixteen_bit(path, orientation)
-                return (
-                    (_finite(array, path), True) if array.dtype.kind == "f" else (array, False)
-                )  # floats are linear
-            if image.mode in ("P", "PA") or "transparency" in image.info:
-                image = image.convert("RGBA")
-            elif image.mode in ("1", "CMYK", "YCbCr", "HSV", "LAB"):
-                image = image.convert("L" if image.mode == "1" else "RGB")
-            array = turn_upright(
-                np.array(standard_colours(image) if colours else image), orientation
-            )
+            return _decoded(path, image, orientation_of(image) if upright else 1)
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
+
+
+def _decoded(path: Path, image: PilImage.Image, orientation: int) -> Decoded:
+    """What Pillow opened, decoded by it or, with more than 8 bits, by OpenCV."""
+    profile = profile_of(image, early_exif(image))
+    if _is_sixteen_bit(path, image):
+        array = _sixteen_bit(path, orientation)
+        if array.dtype.kind == "f":  # floats are linear
+            return Decoded(_finite(array, path), True)
+        return Decoded(array, False, profile)
+    before = orientation_of(image)
+    if image.format == "TIFF":
+        image.load()  # most versions of Pillow turn a TIFF here
+        if before != 1 and image.getexif().get(0x0112, 1) == 1:
+            orientation = 1 if orientation == before else {6: 8, 8: 6}.get(before, before)
+    if image.mode in ("P", "PA") or "transparency" in image.info:
+        image = image.convert("RGBA")
+    elif image.mode in ("1", "YCbCr", "HSV"):
+        image = image.convert("L" if image.mode == "1" else "RGB")
+    array = turn_upright(np.array(rgb_of(image)), orientation)
     if array.dtype == np.int32:  # PIL's mode I: 16-bit grey
         array = np.clip(array, 0, 65535).astype(np.uint16)
-    return array, False
+    return Decoded(array, False, profile)
 
 
-def standard_colours(image: PilImage.Image) -> PilImage.Image:
-    """An 8-bit RGB(A) picture with a colour profile other than sRGB (phones write Display P3) in
-    sRGB codes, clipped to their range."""
-    profile = image.info.get("icc_profile")
-    if not profile or image.mode not in ("RGB", "RGBA"):
-        return image
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in (  # pyright: ignore[reportAttributeAccessIssue]
-            source.profile.profile_description or ""  # pyright: ignore[reportAttributeAccessIssue]
-        ):
-            return image
-        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-        transform = ImageCms.buildTransform(
-            source, ImageCms.createProfile("sRGB"), "RGB", "RGB", intent
-        )
-        out = ImageCms.applyTransform(image.convert("RGB"), transform)
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
-        return image  # a broken profile is no reason to refuse the photo
-    if image.mode == "RGBA":
-        out.putalpha(image.getchannel("A"))
-    return out  # pyright: ignore[reportReturnType]
-
-
-def _is_sixteen_bit(path: Path, suffix: str) -> bool:
-    if suffix == ".png":
+def _is_sixteen_bit(path: Path, image: PilImage.Image) -> bool:
+    """Whether OpenCV decodes it: a PNG of 16 bits, and a TIFF, but of CMYK and Lab, which Pillow
+    knows."""
+    if image.format == "PNG":
         with open(path, "rb") as f:
             return f.read(25)[24:25] == b"\x10"
-    return suffix in (".tif", ".tiff")
+    return image.format == "TIFF" and image.mode not in ("CMYK", "LAB")
 
 
 def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
@@ -134,9 +164,14 @@ def _sixteen_bit(path: Path, orientation: int) -> np.ndarray:
 
     from relit.images.opencv import decode_bytes
 
-    array = decode_bytes(
-        _as_stored(path.read_bytes()), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    )
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    data = _as_stored(path.read_bytes())
+    planes = [decode_bytes(plane, flags) for plane in separate_planes(data)]
+    if planes and all(p is not None and p.ndim == 2 for p in planes):
+        order = [2, 1, 0, *range(3, len(planes))] if len(planes) >= 3 else range(len(planes))
+        array = np.stack([planes[k] for k in order], axis=-1)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    else:
+        array = decode_bytes(data, flags)
     if array is None or array.dtype.kind not in "uf":
         raise ValueError("the pixels could not be decoded")
     if array.ndim == 3:
@@ -208,6 +243,48 @@ def _as_stored(data: bytes) -> bytes:
     return bytes(out)
 
 
+def separate_planes(data: bytes) -> list[bytes]:
+    """Of a TIFF whose channels are stored one after the other, each as a TIFF of grey (OpenCV mixes
+    them up); none of other files. The same pixels are named by a directory of one channel."""
+    order = {b"II": "<", b"MM": ">"}.get(data[:2])
+    if order is None or struct.unpack(order + "H", data[2:4]) != (42,):
+        return []
+    head = TiffImagePlugin.ImageFileDirectory_v2(data[:8])
+    file = io.BytesIO(data)
+    file.seek(head.next)
+    head.load(file)
+    channels = int(head.get(TiffImagePlugin.SAMPLESPERPIXEL, 1))
+    if head.get(TiffImagePlugin.PLANAR_CONFIGURATION, 1) != 2 or not 2 <= channels <= 4:
+        return []
+    lists = {tag: head[tag] for tag in STRIP_TAGS if tag in head}
+    if not lists or any(len(v) % channels for v in lists.values()):
+        return []
+    tags = {tag: int(head[tag]) for tag in PLANE_TAGS if tag in head}
+    bits = head.get(TiffImagePlugin.BITSPERSAMPLE, (8,))
+    kinds = head.get(TiffImagePlugin.SAMPLEFORMAT, (1,))
+    planes = []
+    for k in range(channels):
+        share = {t: v[k * len(v) // channels :][: len(v) // channels] for t, v in lists.items()}
+        grey = {0x0102: (bits[0],), 0x0106: (1,), 0x0115: (1,), 0x011C: (1,), 0x0153: (kinds[0],)}
+        entries = {**{t: (v,) for t, v in tags.items()}, **grey, **share}
+        planes.append(_with_directory(data, entries, order))
+    return planes
+
+
+def _with_directory(data: bytes, entries: dict[int, tuple[int, ...]], order: str) -> bytes:
+    """A TIFF file with another directory, appended: tags with 32-bit numbers."""
+    data = data + bytes(len(data) % 2)
+    body, spill = b"", b""
+    after = len(data) + 2 + 12 * len(entries) + 4
+    for tag, values in sorted(entries.items()):
+        packed = struct.pack(f"{order}{len(values)}I", *values)
+        if len(values) > 1:
+            packed, spill = struct.pack(order + "I", after + len(spill)), spill + packed
+        body += struct.pack(order + "HHI", tag, 4, len(values)) + packed
+    directory = struct.pack(order + "H", len(entries)) + body + bytes(4) + spill
+    return data[:4] + struct.pack(order + "I", len(data)) + data[8:] + directory
+
+
 def early_exif(image: PilImage.Image) -> PilImage.Exif:
     """EXIF by what stands before the pixels: Pillow decodes a whole PNG to look for more. Ask
     before the pixels are loaded."""
@@ -248,29 +325,29 @@ def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
 
 @contextmanager
 def pil(path: Path):
-    if path.suffix.lower() in HEIC:
+    """An open Pillow image; what the file is counts, not its extension."""
+    content = content_of(path)
+    if content == "HEIC" or path.suffix.lower() in HEIC:
         try:
             from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
         except ImportError as error:
+            named = "" if path.suffix.lower() in HEIC else f", which '{path.name}' is in truth,"
             raise UserError(
-                "HEIC photos need an optional package",
+                f"HEIC photos{named} need an optional package",
                 "pillow-heif is not installed",
                 f"pip install 'relit[heic]', or convert to JPEG: {path}",
             ) from error
         register_heif_opener()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # Pillow warns of large images; the limit here is our own, and an error
-            image = PilImage.open(path)
-    except (
-        UnidentifiedImageError,
-        OSError,
-        SyntaxError,
-        ValueError,
-        PilImage.DecompressionBombError,
-    ) as error:
+        with _UNLIMITED, warnings.catch_warnings():
+            # Pillow refuses large images as bombs; the limit here is our own, with its own message
+            warnings.simplefilter("ignore")
+            limit, PilImage.MAX_IMAGE_PIXELS = PilImage.MAX_IMAGE_PIXELS, None
+            try:
+                image = PilImage.open(path)
+            finally:
+                PilImage.MAX_IMAGE_PIXELS = limit
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise broken(path, str(error)) from error
     with image:
         _too_large(path, *image.size)
@@ -305,7 +382,36 @@ def rawpy():
     return rawpy
 
 
+def content_of(path: Path) -> str:
+    """What a file holds by its first bytes: 'picture' for what Pillow reads, else its kind, ''
+    where it is not known."""
+    try:
+        with open(path, "rb") as f:
+            head = f.read(64)
+    except OSError:
+        return ""
+    if not head:
+        return "an empty file"
+    if head[4:8] == b"ftyp":
+        brands = {head[k : k + 4] for k in (8, *range(16, len(head) - 3, 4))}
+        still = next((kind for brand, kind in BRANDS.items() if brand in brands), None)
+        return still or "a video (MP4 or QuickTime)"
+    start = head.lstrip().lower()
+    return next((kind for magic, kind in MAGIC if head.startswith(magic)), "") or (
+        "a web page" if start.startswith((b"<!doctype", b"<html")) else ""
+    )
+
+
 def broken(path: Path, reason: str) -> UserError:
+    """The error for a file that no decoder reads, with its true reason: another kind of file under
+    this name, or damage."""
+    content = content_of(path)
+    if content not in ("", "picture"):
+        return UserError(
+            "an image file cannot be read",
+            f"it is {content} in truth",
+            f"convert it, get it again, or take it out of the folder: {path}",
+        )
     return UserError(
         "an image file cannot be read",
         f"{reason.replace(str(path), 'the file')} (truncated or damaged)",

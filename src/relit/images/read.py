@@ -26,10 +26,10 @@ from relit.images.decode import (
     orientation_of,
     pil,
     raw_file,
-    standard_colours,
     stored_size,
     turn_upright,
 )
+from relit.images.profiles import profile_of, rgb_of
 from relit.images.write import codes_of
 
 FULL_FRAME_DIAGONAL = (
@@ -71,19 +71,25 @@ class Header:
     def turned(self) -> bool:
         return self.orientation >= 5
 
+    @property
+    def as_stored(self) -> tuple[int, int]:
+        """Width and height of the pixels as stored, before EXIF turns them."""
+        return (self.height, self.width) if self.turned else (self.width, self.height)
+
 
 def read_image(path: str | Path, upright: bool = True) -> Image:
     """Decode a photo to linear float32, EXIF orientation applied once (or not at all with
     upright=False).
 
-    8/16-bit PNG, JPEG, WebP, TIFF (sRGB curve removed; 8-bit files with another colour profile are
-    carried to sRGB before), EXR, HDR and TIFF of floats (linear already), HEIC and RAW with the
+    8/16-bit PNG, JPEG, WebP, AVIF, TIFF (by their colour profile, else the sRGB curve is removed),
+    EXR, HDR and TIFF of floats (linear already), HEIC and RAW with the
     optional extras.
     Raises UserError for a missing, truncated, oversized or unknown file and for NaN or infinite
     pixels.
     """
     path = Path(path)
-    array, is_linear = decode(path, upright)
+    decoded = decode(path, upright)
+    array, is_linear = decoded.codes, decoded.linear
     alpha, clipped = None, None
     if array.ndim == 2:
         array = array[..., None]
@@ -93,7 +99,9 @@ def read_image(path: str | Path, upright: bool = True) -> Image:
     if array.dtype.kind == "u":
         clipped = (array == np.iinfo(array.dtype).max).any(axis=-1)
     array = np.repeat(array, 3, axis=2) if array.shape[2] == 1 else array[..., :3]
-    if array.dtype.kind == "u" and not is_linear:
+    if decoded.profile is not None:
+        rgb = decoded.profile.linear(_unit(array))
+    elif array.dtype.kind == "u" and not is_linear:
         rgb = _code_table(array.dtype.str)[
             array
         ]  # one look-up instead of a dozen arrays of the photo's size
@@ -133,19 +141,21 @@ def read_small(path: str | Path, side: int = 256, upright: bool = True) -> Image
             orientation = orientation_of(image) if upright else 1
             image.draft("RGB", (side, side))
             has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+            profile = profile_of(image, early_exif(image))
             if image.mode.startswith("I") or image.format == "TIFF":
-                array, _ = decode(path, upright=False, colours=False)
-                image = PilImage.fromarray(codes_of(_unit(array)))
-            small = image.convert("RGBA" if has_alpha else "RGB")
+                image = PilImage.fromarray(codes_of(_unit(decode(path, upright=False).codes)))
+            small = rgb_of(image).convert("RGBA" if has_alpha else "RGB")
             small = (
                 small.reduce(max(1, max(small.size) // side))
                 if max(small.size) >= 2 * side
                 else small
             )
-            array = turn_upright(_unit(np.array(standard_colours(small))), orientation)
+            array = turn_upright(_unit(np.array(small)), orientation)
         except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
             raise broken(path, str(error)) from error
-    return Image(linear_from_srgb(array[..., :3]), array[..., 3] if has_alpha else None)
+    rgb = array[..., :3]
+    linear = linear_from_srgb(rgb) if profile is None else profile.linear(rgb)
+    return Image(linear, array[..., 3] if has_alpha else None)
 
 
 def _is_float(path: Path) -> bool:
@@ -159,7 +169,7 @@ def _is_float(path: Path) -> bool:
 def read_data(path: str | Path) -> np.ndarray:
     """Decode without a transfer curve: (H, W) or (H, W, C) float32; 8/16-bit codes divided by their
     largest value. No alpha handling."""
-    array, _ = decode(Path(path), colours=False)
+    array = decode(Path(path)).codes
     array = _unit(array) if array.dtype.kind == "u" else array.astype(np.float32)
     return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
 

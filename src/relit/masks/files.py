@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import unicodedata
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,40 +15,61 @@ from relit.images.decode import CODED, pil
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr")
 FOLDERS = ("masks", "mask", "segmentations", "silhouettes")
+NAMED_MASK = re.compile(
+    r"(?<![a-z])(object|fg|sam)?(mask|silhouette|matte|segmentation)s?(?![a-z])"
+)
+AFFIX = re.compile(
+    r"^(object_|fg_)?(mask|matte|silhouette)[_.-]+|[_.-]+(object_|fg_)?(mask|matte|silhouette|seg)s?$",
+    re.IGNORECASE,
+)  # of a mask's stem, beside its photo's name
+PHOTO_FOLDERS = ("images", "image", "rgb", "input", "photos")  # masks/ may lie beside them
 LOSSY = (".jpg", ".jpeg", ".webp")  # black is not exactly 0 there
 BORDER = 0.9  # an inverted mask covers at least this share of the photo's border
 
 
 def find_mask(photo: Path, root: Path, index: dict[str, Path]) -> Path | None:
-    """The mask of a photo: STEM_mask.png or STEM.mask.png beside it, else a file of the same name,
-    stem or number in a mask folder."""
+    """The mask of a photo: STEM_mask.png, STEM.mask.png or NAME.jpg.mask.png beside it, else a file
+    of the same name, stem or number in a mask folder. Unicode form and letter case do not
+    matter."""
+    beside = _masks_beside(photo.parent, photo.parent.stat().st_mtime_ns)
     bare = photo.stem.removesuffix("_rgb")  # Synthetic4Relight: 000_rgb.exr, 000_mask.png
-    for name in dict.fromkeys((f"{photo.stem}_mask", f"{photo.stem}.mask", f"{bare}_mask")):
-        for suffix in (*MASK_SUFFIXES, *map(str.upper, MASK_SUFFIXES)):
-            if (photo.parent / (name + suffix)).is_file():
-                return photo.parent / (name + suffix)
+    for name in (photo.name, photo.stem, bare):
+        if _folded(name) in beside:
+            return beside[_folded(name)]
     relative = photo.relative_to(root).as_posix() if photo.is_relative_to(root) else photo.name
     without_top = relative.split("/", 1)[-1]
     exact = [
         k for r in (relative, without_top) for k in (r + ".png", r, str(Path(r).with_suffix("")))
     ]  # train/000 before 000
-    for key in (*exact, photo.name, photo.stem, f"{photo.stem}_mask"):
-        if key in index:
-            return index[key]
+    for key in (*exact, photo.name, photo.stem):
+        if _folded(key) in index:
+            return index[_folded(key)]
     number = _number(photo.stem)
     return index.get(f"#{number}") if number is not None else None
 
 
+@lru_cache(maxsize=16)
+def _masks_beside(folder: Path, changed: int) -> dict[str, Path]:
+    """Files of a folder that are masks by their names: name or stem of the photo -> mask. changed:
+    the folder's time of change, so that a new file is seen."""
+    out: dict[str, Path] = {}
+    for file in sorted(folder.iterdir()):
+        stem = AFFIX.sub("", file.stem)
+        hidden = file.name.startswith(".") or file.suffix.lower() not in MASK_SUFFIXES
+        if stem != file.stem and not hidden:
+            out.setdefault(_folded(stem), file)
+    return out
+
+
 def index_masks(root: Path) -> tuple[Path | None, dict[str, Path]]:
-    """The mask folder of a capture (or None) and its files by relative name, name, stem and
-    number."""
-    for base in dict.fromkeys([root, root.parent if root.name in ("images", "image") else root]):
-        for name in FOLDERS:
-            folder = base / name
-            files = (
-                sorted(f for f in folder.rglob("*") if f.suffix.lower() in EXTENSIONS)
-                if folder.is_dir()
-                else []
+    """The mask folder of a capture (or None) and its files by relative name, name, stem (without
+    what says that it is a mask) and number."""
+    for base in dict.fromkeys([root, root.parent if root.name.lower() in PHOTO_FOLDERS else root]):
+        for folder in mask_folders(base):
+            files = sorted(
+                f
+                for f in folder.rglob("*")
+                if f.suffix.lower() in EXTENSIONS and not f.name.startswith(".")
             )
             if not files:
                 continue
@@ -61,9 +84,34 @@ def index_masks(root: Path) -> tuple[Path | None, dict[str, Path]]:
                     f.stem,
                     *([f"#{number}"] if number is not None else []),
                 ):
-                    index.setdefault(key, f)
+                    index.setdefault(_folded(key), f)
+            for f in files:
+                index.setdefault(_folded(AFFIX.sub("", f.stem)), f)
             return folder, index
     return None, {}
+
+
+def mask_folders(root: Path) -> list[Path]:
+    """Sub-folders whose names say that they hold masks, in any letter case: FOLDERS in their order,
+    then others such as object_mask/ or fg_masks/."""
+    if not root.is_dir():
+        return []
+    inside = sorted(d for d in root.iterdir() if d.is_dir() and not d.name.startswith("."))
+    rank = {name: k for k, name in enumerate(FOLDERS)}
+    named = [d for d in inside if d.name.lower() in rank]
+    others = [d for d in inside if d not in named and names_masks(d.name)]
+    return [*sorted(named, key=lambda d: (rank[d.name.lower()], d.name)), *others]
+
+
+def names_masks(folder: str) -> bool:
+    """Whether the name of a folder says that it holds masks of the object. BOP's mask_visib holds
+    those of instances, instant-ngp's dynamic masks those of what moves."""
+    name = folder.lower()
+    return NAMED_MASK.search(name) is not None and not re.search(r"visib|dynamic", name)
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _number(stem: str) -> int | None:
@@ -144,6 +192,24 @@ def looks_inverted(mask: np.ndarray) -> bool:
     return bool(area[away].sum() > 0.8 * area.sum())
 
 
+def _is_negative(mask: np.ndarray) -> bool:
+    """True when the corners are white and the middle is black: an inverted mask whose object
+    touches the border. Of an object that fills the picture the middle is white."""
+    h, w = mask.shape
+    a, b = max(1, h // 8), max(1, w // 8)
+    corners = (mask[:a, :b], mask[:a, -b:], mask[-a:, :b], mask[-a:, -b:])
+    middle = mask[h // 2 - a // 2 : h // 2 + a // 2 + 1, w // 2 - b // 2 : w // 2 + b // 2 + 1]
+    white = sum(float((c > 0.5).mean()) > 0.8 for c in corners)
+    return white >= 3 and float((middle > 0.5).mean()) < 0.2 and border_share(mask) > 0.5
+
+
+def _most(turned: list[str], rest: dict[str, np.ndarray], inverted: list[str]) -> bool:
+    """Whether the masks are inverted though the object touches the border in some: nearly all look
+    so, and no mask looks right, with black corners and a white middle."""
+    right = [n for n, m in rest.items() if n not in turned and _is_negative(1.0 - m)]
+    return len(rest) >= 3 and len(turned) >= 0.8 * len(rest) and len(right) <= 0.1 * len(rest)
+
+
 def judge(masks: dict[str, np.ndarray], source: str) -> tuple[bool, list[str]]:
     """Look at all masks of a capture (name -> (h, w) small mask).
 
@@ -167,7 +233,8 @@ def judge(masks: dict[str, np.ndarray], source: str) -> tuple[bool, list[str]]:
         )
     rest = {n: m for n, m in masks.items() if n not in empty and n not in full}
     inverted = [n for n, m in rest.items() if looks_inverted(m)]
-    if rest and len(inverted) >= 0.8 * len(rest):
+    turned = [n for n, m in rest.items() if n in inverted or _is_negative(m)]
+    if rest and (len(inverted) >= 0.8 * len(rest) or _most(turned, rest, inverted)):
         return True, full  # of an inverted set, the all-white ones are the empty ones
     if len(inverted) > max(1, 0.2 * len(rest)):
         raise UserError(

@@ -10,6 +10,11 @@ import numpy as np
 from relit.conventions import srgb_from_linear
 
 BAND = 0.03  # width of the border that is looked at, as a share of the shorter side
+BLACK = 0.05  # sRGB value below which a pixel holds no picture: bars, edges of undistorted photos
+FRAME = 0.005  # share of a picture that a black frame covers at least
+ROUND = 0.93  # share of its convex hull that the picture inside a black frame fills
+FILLED = 0.6  # share of the pixels inside the frame's edge that are not black
+MOST_SHADOW = 0.2  # share of the photos in which they may be
 DARK = 0.12  # sRGB value below which a backdrop counts as dark
 
 
@@ -65,6 +70,54 @@ def find_backdrop(photos: list[np.ndarray]) -> Backdrop | None:
     if np.mean([0.01 < s < 0.85 for s in shares]) < 0.8:
         return None
     return Backdrop(bool(middle.max() < DARK), tolerance)
+
+
+def black_frame(photos: list[np.ndarray]) -> float | None:
+    """Share of the picture that a black frame covers, from small linear photos (each (h, w, 3)):
+    bars of a video, the outside of a fisheye's circle, edges of undistorted photos. None where
+    there is none: of a dark backdrop the object's outline changes from photo to photo, and what
+    lies along the union of the outlines is mostly black in each photo.
+    """
+    shapes = [p.shape for p in photos]
+    common = max(set(shapes), key=shapes.count)
+    coded = [_smoothed(p) for p in photos if p.shape == common]
+    if len(coded) < max(3, 0.8 * len(photos)):
+        return None
+    black = np.array([c.max(axis=-1) < BLACK for c in coded])
+    always = black.mean(axis=0) > 0.9
+    labels = cv2.connectedComponents(always.astype(np.uint8), connectivity=4)[1]
+    edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    dead = np.isin(labels, edge[edge > 0])
+    live = ~dead
+    if dead.mean() < FRAME or live.mean() < 0.1 or not (_is_around(dead) and _is_framed(live)):
+        return None
+    near = cv2.dilate(dead.astype(np.uint8), np.ones((5, 5)))  # blurred by JPEG and resampling
+    ring = live & (cv2.dilate(near, np.ones((7, 7))) > 0) & (near == 0)
+    filled = ~black[:, ring]
+    shadowed = filled.mean(axis=1) < FILLED
+    return float(dead.mean()) if ring.any() and shadowed.mean() <= MOST_SHADOW else None
+
+
+def _is_around(dead: np.ndarray) -> bool:
+    """Whether a black area (h, w) lies at both ends of the picture in like manner: in all corners,
+    or in the middle of opposite sides. What is dark in the scene lies at one end."""
+    h, w = dead.shape
+    corners = dead[0, 0] and dead[0, -1] and dead[-1, 0] and dead[-1, -1]
+    sides = (dead[h // 2, 0] and dead[h // 2, -1]) or (dead[0, w // 2] and dead[-1, w // 2])
+    return bool(corners or sides)
+
+
+def _is_framed(live: np.ndarray) -> bool:
+    """Whether an area (h, w) has the shape of a picture inside a black frame: convex or nearly so,
+    and as large as the photo in one direction; or a rectangle that is most of the photo."""
+    contours, _ = cv2.findContours(live.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    largest = max(contours, key=cv2.contourArea)
+    x, y, bw, bh = cv2.boundingRect(largest)
+    h, w = live.shape
+    area, hull = cv2.contourArea(largest), cv2.contourArea(cv2.convexHull(largest))
+    across = (x <= 2 and x + bw >= w - 2) or (y <= 2 and y + bh >= h - 2)
+    box = area > 0.97 * (bw - 1) * (bh - 1) and area > 0.4 * h * w
+    return area > ROUND * max(hull, 1.0) and (across or box)
 
 
 def _smoothed(rgb: np.ndarray) -> np.ndarray:

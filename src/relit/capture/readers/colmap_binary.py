@@ -52,6 +52,17 @@ def _images(data: bytes) -> int:
     return at
 
 
+def without_observations(data: bytes) -> bytes:
+    """images.bin whose images see no point, for a model without points."""
+    count, at = struct.unpack_from("<Q", data)[0], 8
+    out = [data[:8]]
+    for _ in range(count):
+        end = data.index(b"\0", at + 64) + 1
+        out += [data[at:end], bytes(8)]
+        at = end + 8 + 24 * struct.unpack_from("<Q", data, end)[0]
+    return b"".join(out)
+
+
 def _points(data: bytes) -> int:
     count, at = struct.unpack_from("<Q", data)[0], 8
     for _ in range(count):

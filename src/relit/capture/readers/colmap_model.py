@@ -1,24 +1,36 @@
-"""COLMAP models, binary or text, read by pycolmap; OpenCV axes, pixel centres at +0.5. The largest
-of several models is taken."""
+"""COLMAP models, binary or text, read by pycolmap; OpenCV axes, pixel centres at +0.5. Of several
+models the one that belongs to the photos is taken."""
 
 from __future__ import annotations
 
-from collections import Counter
+import struct
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from relit.capture.frames import IMAGE_FOLDERS, Frame, Reading, path_inside
-from relit.capture.readers.colmap_binary import check_binary
+from relit.capture.frames import Frame, Reading
+from relit.capture.listing import image_folders
+from relit.capture.names import NameIndex, path_inside
+from relit.capture.readers.colmap_complete import load_model, model_ending
 from relit.device import load_pycolmap
 from relit.errors import UserError
 from relit.geometry.lens import FisheyeLens, Lens
-from relit.images import EXTENSIONS
+from relit.images import read_header
 from relit.scene import Camera
 
-LOOKED_FOR = "sparse/ with cameras, images and points3D as .bin or .txt (COLMAP)"
+LOOKED_FOR = "sparse/ with cameras and images as .bin or .txt (COLMAP)"
+ONE_FOCAL = {  # models of COLMAP with parameters f, cx, cy, ...
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "SIMPLE_FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+}
+TWO_FOCAL = {"PINHOLE", "OPENCV", "FULL_OPENCV", "FISHEYE", "OPENCV_FISHEYE"}  # fx, fy, cx, cy, ...
 MAX_ERROR = 2.0  # pixels; sparse points with a larger reprojection error are not used
 
 
@@ -43,31 +55,22 @@ class ColmapLens:
     def __call__(self, xy: np.ndarray) -> np.ndarray:
         c = self._camera
         pixels = c.img_from_cam(np.concatenate([xy, np.ones((len(xy), 1))], axis=1))
-        return (pixels - (c.principal_point_x, c.principal_point_y)) / (
-            c.mean_focal_length(),
-            c.mean_focal_length(),
-        )
+        return (pixels - centre_of(c)) / focal_of(c)
 
 
 def model_folders(path: Path) -> list[Path]:
     """Folders at or below `path` that hold a model, in the places where COLMAP and nerfstudio put
-    them."""
-    tops = [path, path / "sparse", path / "colmap" / "sparse", path / "dense" / "sparse"]
+    them. points3D may be missing."""
+    dense = path / "dense"
+    parts = sorted(d / "sparse" for d in dense.iterdir()) if dense.is_dir() else []
+    tops = [path, path / "sparse", path / "colmap" / "sparse", dense / "sparse", *parts]
     places = [
         d
         for top in tops
         if top.is_dir()
         for d in (top, *sorted(x for x in top.iterdir() if x.is_dir()))
     ]
-    unique = dict.fromkeys(places)
-    return [
-        d
-        for d in unique
-        if any(
-            all((d / f"{n}.{e}").is_file() for n in ("cameras", "images", "points3D"))
-            for e in ("bin", "txt")
-        )
-    ]
+    return [d for d in dict.fromkeys(places) if model_ending(d) is not None]
 
 
 def recognise(path: Path) -> Path | None:
@@ -75,51 +78,71 @@ def recognise(path: Path) -> Path | None:
     return next(iter(model_folders(path)), None) if path.is_dir() else None
 
 
+@dataclass(frozen=True)
+class Located:
+    """A model and where its photos lie. files: of each registered image (pycolmap.Image, by name)
+    its photo, or None. index: how they were found."""
+
+    model: Any
+    folder: Path
+    root: Path
+    base: Path
+    files: tuple[tuple[Any, Path | None], ...]
+    index: NameIndex
+    notes: tuple[str, ...]
+
+    @cached_property
+    def rank(self) -> tuple[int, int, int]:
+        """Photos of exactly the calibrated size, photos that are there, images: the model that
+        belongs to the photos has most. Of a workspace with sparse/ and dense/0/ the photos that
+        are there may be the undistorted ones."""
+        there = [(i, f) for i, f in self.files if f is not None]
+        exact = sum(read_header(f).as_stored == _size(i.camera) for i, f in there)
+        return exact, len(there), len(self.files)
+
+
 def read(path: Path, found: Path) -> Reading:
-    """Read the largest model."""
-    pycolmap = load_pycolmap()
-
-    models, notes = [], []
-    for folder in model_folders(path):
-        try:
-            check_binary(folder)
-            models.append((pycolmap.Reconstruction(str(folder)), folder))
-        except (RuntimeError, ValueError, IndexError, MemoryError, OSError) as error:
-            raise UserError(
-                "a COLMAP model cannot be read",
-                str(error).splitlines()[0][:200],
-                f"export it again: {folder}",
-            ) from error
-    model, folder = max(models, key=lambda m: m[0].num_reg_images())
-    if len(models) > 1:
-        sizes = ", ".join(str(m.num_reg_images()) for m, _ in models)
+    """Read the model that belongs to the photos; of several such the largest."""
+    folders = model_folders(path)
+    located = [_located(path, folder) for folder in folders]
+    chosen = max(located, key=lambda m: m.rank) if len(located) > 1 else located[0]
+    notes = list(chosen.notes)
+    if len(located) > 1:
+        sizes = ", ".join(str(len(m.files)) for m in located)
+        largest = sum(len(m.files) >= len(chosen.files) for m in located) == 1
+        which = "the largest" if largest else "the one that belongs to the photos"
         notes.append(
-            f"{len(models)} COLMAP models with {sizes} photos: the largest was read ({folder.relative_to(path)})"
+            f"{len(located)} COLMAP models with {sizes} photos: {which} was read "
+            f"({chosen.folder.relative_to(path)})"
         )
-    root = (
-        path
-        if path != folder
-        else next(
-            (
-                p
-                for p in (folder, *folder.parents[:2])
-                if any((p / n).is_dir() for n in IMAGE_FOLDERS)
-            ),
-            folder,
-        )
-    )
     try:
-        frames = tuple(_frames(model, root, folder, notes))
+        frames = tuple(_frames(chosen, notes))
     except (RuntimeError, ValueError, IndexError, ZeroDivisionError) as error:
-        raise UserError(
-            "a COLMAP model cannot be used",
-            str(error).splitlines()[0][:200],
-            f"export it again: {folder}",
-        ) from None
-    return Reading("colmap", root, frames, points=sparse_points(model), notes=tuple(notes))
+        raise _unusable("used", error, chosen.folder) from None
+    points = sparse_points(chosen.model)
+    return Reading("colmap", chosen.root, frames, points=points, notes=tuple(notes))
 
 
-def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
+def _size(camera) -> tuple[int, int]:
+    return camera.width, camera.height
+
+
+def _unusable(what: str, error: Exception, folder: Path) -> UserError:
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return UserError(f"a COLMAP model cannot be {what}", reason[:200], f"export it again: {folder}")
+
+
+def _located(path: Path, folder: Path) -> Located:
+    """Load a model and find its photos."""
+    try:
+        model, notes = load_model(folder)
+        images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda i: i.name)  # pyright: ignore[reportAttributeAccessIssue]
+    except (RuntimeError, ValueError, IndexError, MemoryError, OSError, struct.error) as error:
+        raise _unusable("read", error, folder) from error
+    root = path
+    if path == folder:
+        above = (folder, *folder.parents[:2])
+        root = next((p for p in above if len(image_folders(p)) > 1), folder)
     # the images beside the model (dense/images with dense/sparse) before those of the folder that
     # was opened
     places = [
@@ -127,21 +150,21 @@ def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
         for p in dict.fromkeys((folder.parent, folder.parent.parent, root))
         if p.is_relative_to(root)
     ]
-    base = next((p / n for p in places for n in IMAGE_FOLDERS if (p / n).is_dir()), root)
-    images = [model.image(i) for i in model.reg_image_ids()]
-    named = {path_inside(base, i.name, folder) for i in images}  # these belong to their own cameras
-    spare = [
-        f for f in sorted(base.rglob("*")) if f.suffix.lower() in EXTENSIONS and f not in named
-    ]
-    by_name, by_stem = _unique(spare, "name"), _unique(spare, "stem")
-    frames, missing = [], []
-    for image in sorted(images, key=lambda i: i.name):
-        file = path_inside(base, image.name, folder)
-        file = (
-            file
-            if file.is_file()
-            else by_name.get(Path(image.name).name) or by_stem.get(Path(image.name).stem)
-        )
+    bases = [d for p in places for d in image_folders(p) if d != p] or [root]
+    index = NameIndex(root)
+    files = [index.find(i.name, bases, anywhere=False) for i in images]
+    if not any(files):  # of photos that are partly there no others are taken
+        files = [index.find(i.name, bases) for i in images]
+    for image, file in zip(images, files, strict=True):
+        if file is None:
+            path_inside(bases[0], image.name, folder)
+    pairs = tuple(zip(images, files, strict=True))
+    return Located(model, folder, root, bases[0], pairs, index, tuple(notes))
+
+
+def _frames(located: Located, notes: list[str]) -> list[Frame]:
+    root, frames, missing = located.root, [], []
+    for image, file in located.files:
         if file is None:
             missing.append(image.name)
             continue
@@ -162,22 +185,21 @@ def _frames(model, root: Path, folder: Path, notes: list[str]) -> list[Frame]:
             raise ValueError(f"the camera of {image.name} makes no sense")
         frames.append(Frame(file, file.relative_to(root).as_posix(), camera, lens))
     if not frames or len(missing) > len(frames) + 1:
+        example = f", for example '{missing[0]}'" if missing else ""
         raise UserError(
-            f"{len(missing)} of {len(missing) + len(frames)} photos of the COLMAP model are not there, for example '{missing[0]}'",
-            "the images and the cameras do not match by name",
-            f"put the images in: {base}",
+            f"{len(missing)} of {len(located.files)} photos of the COLMAP model are not there"
+            + example,
+            "the images and the cameras do not match by name"
+            if missing
+            else "the model registers no image",
+            f"put the images in: {located.base}",
         )
+    notes += located.index.notes("photos of the COLMAP model")
     if missing:
         notes.append(
             f"{len(missing)} photos of the COLMAP model are not there and were left out, for example {missing[0]}"
         )
     return frames
-
-
-def _unique(files: list[Path], key: str) -> dict[str, Path]:
-    """name or stem -> file, of those that only one file has."""
-    counts = Counter(getattr(f, key) for f in files)
-    return {getattr(f, key): f for f in files if counts[getattr(f, key)] == 1}
 
 
 def is_pose(camera: Camera) -> bool:
@@ -208,28 +230,34 @@ def sparse_points(model) -> np.ndarray | None:
 def camera_from_colmap(camera, pose: np.ndarray) -> tuple[Camera, Lens | None]:
     """pycolmap.Camera and a pose -> (Camera, lens or None for a pinhole or OpenCV's model)."""
     model, p = camera.model.name, [float(v) for v in camera.params]
-    single = model in (
-        "SIMPLE_PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-    )
-    fx, fy, cx, cy, *k = [p[0], *p] if single else p
     lens: Lens | None = None
     distortion: tuple[float, ...] = ()
-    if model in ("SIMPLE_PINHOLE", "PINHOLE"):
-        pass
+    if model not in ONE_FOCAL | TWO_FOCAL:
+        fx = fy = focal_of(camera)
+        cx, cy = centre_of(camera)
+        lens = ColmapLens(model, camera.width, camera.height, tuple(p))
+        return Camera(camera.width, camera.height, fx, fy, cx, cy, pose, distortion), lens
+    fx, fy, cx, cy, *k = [p[0], *p] if model in ONE_FOCAL else p
+    if "FISHEYE" in model:
+        lens = FisheyeLens(tuple(k))
     elif model == "SIMPLE_RADIAL":
         distortion = (k[0], 0.0, 0.0, 0.0)
     elif model == "RADIAL":
         distortion = (k[0], k[1], 0.0, 0.0)
     elif model in ("OPENCV", "FULL_OPENCV"):
         distortion = tuple(k)
-    elif model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"):
-        lens = FisheyeLens(tuple(k))
-    else:
-        fx = fy = camera.mean_focal_length()
-        cx, cy = camera.principal_point_x, camera.principal_point_y
-        lens = ColmapLens(model, camera.width, camera.height, tuple(p))
     return Camera(camera.width, camera.height, fx, fy, cx, cy, pose, distortion), lens
+
+
+def focal_of(camera) -> float:
+    """Pixels per radian (a panorama) or per unit at depth 1 of a pycolmap.Camera."""
+    if camera.model.name == "EQUIRECTANGULAR":
+        return camera.width / (2 * np.pi)
+    return camera.mean_focal_length()
+
+
+def centre_of(camera) -> tuple[float, float]:
+    """The principal point of a pycolmap.Camera, of a panorama its middle, in pixels."""
+    if camera.model.name == "EQUIRECTANGULAR":
+        return camera.width / 2, camera.height / 2
+    return camera.principal_point_x, camera.principal_point_y

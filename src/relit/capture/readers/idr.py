@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
-from relit.capture.frames import Frame, Reading, image_folder, list_images
+from relit.capture.frames import Frame, Reading
+from relit.capture.listing import image_folder, list_images
 from relit.conventions import scale_of
 from relit.errors import UserError
 from relit.files import NO_ARRAYS
@@ -68,9 +69,7 @@ def read(path: Path, found: Path) -> Reading:
             )
         k, pose = decompose_projection(world_mat[:3], f"world_mat_{index}", found)
         header = read_header(file)
-        camera = Camera(
-            header.width, header.height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose
-        )
+        camera = Camera(*header.as_stored, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose)
         frames.append(
             Frame(
                 file,

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, list_images, parse_json_file, pose_from, read_text
+from relit.capture.frames import Frame, Reading, parse_json_file, pose_from, read_text
+from relit.capture.listing import list_images
 from relit.conventions import cv_from_mitsuba_axes
 from relit.errors import UserError
 from relit.scene import Camera, Sphere

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, image_folder, list_images, pose_from
+from relit.capture.frames import Frame, Reading, pose_from
+from relit.capture.listing import image_folder, list_images, photo_folders
 from relit.errors import UserError
 from relit.files import NO_ARRAYS
 from relit.scene import Camera
@@ -34,6 +35,13 @@ def read(path: Path, found: Path) -> Reading:
         raise UserError(
             "a pose file cannot be read", str(error), f"write it again: {found}"
         ) from error
+    if rows.ndim == 2 and rows.shape[1] == 14 and rows.dtype.kind == "f":
+        raise UserError(
+            "the rows of a pose file have 14 columns, 17 are needed",
+            "height, width and focal length of each photo are missing (Nex and Shiny write them to "
+            "hwf_cxcy.npy)",
+            f"write 3 x 5 [R | t | h w f], then near and far: {found}",
+        )
     if (
         rows.ndim != 2
         or rows.shape[1] not in (15, 17)
@@ -51,7 +59,7 @@ def read(path: Path, found: Path) -> Reading:
         raise UserError(
             f"{len(rows)} cameras and {len(files)} photos do not match",
             "each row of poses_bounds.npy belongs to one photo, in order of name",
-            f"add or remove photos until the numbers agree: {found}",
+            f"add or remove photos until the numbers agree{_elsewhere(found.parent, folder)}: {found}",
         )
     frames = []
     for file, row in zip(files, rows.astype(np.float64), strict=True):
@@ -74,3 +82,9 @@ def read(path: Path, found: Path) -> Reading:
             )
         )
     return Reading("llff", found.parent, tuple(frames))
+
+
+def _elsewhere(root: Path, taken: Path | None) -> str:
+    """Other folders that hold photos, for the message."""
+    others = [f"{d.name}/ holds {n}" for d, n in photo_folders(root, 1) if d != taken]
+    return f" ({', '.join(others[:4])})" if others else ""

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, path_inside, pose_from, read_text
+from relit.capture.frames import Frame, Reading, pose_from, read_text
+from relit.capture.names import NameIndex, path_inside
 from relit.errors import UserError
 from relit.images import read_header
 from relit.scene import Camera
@@ -29,18 +30,17 @@ def recognise(path: Path) -> Path | None:
 def read(path: Path, found: Path) -> Reading:
     """Read the parameter file; photos that it names and that are not there are left out with a
     note."""
-    frames, missing = [], []
+    index, frames, missing = NameIndex(found.parent), [], []
     for name, values in parse(read_text(found), found):
-        file = path_inside(found.parent, name, found)
-        if not file.is_file():
+        file = index.find(name)
+        if file is None:
+            path_inside(found.parent, name, found)
             missing.append(name)
             continue
         k, r, t = values[:9].reshape(3, 3), values[9:18].reshape(3, 3), values[18:]
         pose = np.linalg.inv(pose_from(np.column_stack([r, t]), f"'{name}'", found))
         header = read_header(file)
-        camera = Camera(
-            header.width, header.height, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose
-        )
+        camera = Camera(*header.as_stored, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5, pose)
         frames.append(Frame(file, file.relative_to(found.parent).as_posix(), camera))
     if not frames or len(missing) > len(frames) + 1:
         raise UserError(
@@ -48,7 +48,7 @@ def read(path: Path, found: Path) -> Reading:
             "the images and the cameras do not belong together",
             f"put the images beside: {found}",
         )
-    notes = (
+    notes = tuple(index.notes("photos")) + (
         (f"{len(missing)} photos named in {found.name} are not there and were left out",)
         if missing
         else ()

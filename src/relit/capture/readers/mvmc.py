@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from relit import files
-from relit.capture.frames import Frame, Reading, image_folder, parse_json_file, path_inside
+from relit.capture.frames import Frame, Reading, parse_json_file
+from relit.capture.listing import image_folder
+from relit.capture.names import NameIndex, path_inside
 from relit.errors import UserError
 from relit.masks.rle import runs_from
 
@@ -47,10 +49,11 @@ def read(path: Path, found: Path) -> Reading:
     """The photos in order of name, with their masks."""
     root = found.parent
     folder = image_folder(root) or root
-    frames = []
+    index, frames = NameIndex(root), []
     for entry in entries_of(found):
-        file = path_inside(folder, entry["filename"], found)
-        if not file.is_file():
+        file = index.find(entry["filename"], (folder,))
+        if file is None:
+            path_inside(folder, entry["filename"], found)
             raise UserError(
                 f"a photo of {ANNOTATIONS} is missing: '{entry['filename']}'",
                 fix=f"add it to {folder}, or take its entry out",
@@ -59,7 +62,8 @@ def read(path: Path, found: Path) -> Reading:
             runs_from(entry["mask"], entry["filename"]) if entry.get("mask") is not None else None
         )
         frames.append(Frame(file, file.relative_to(root).as_posix(), runs=runs))
-    return Reading("mvmc", root, tuple(sorted(frames, key=lambda f: f.name)), kind="collection")
+    ordered = tuple(sorted(frames, key=lambda f: f.name))
+    return Reading("mvmc", root, ordered, notes=tuple(index.notes("photos")), kind="collection")
 
 
 def entries_of(found: Path) -> list[dict]:

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from relit import files
-from relit.capture.frames import Frame, Reading, image_folder, list_images, parse_json_file
+from relit.capture.frames import Frame, Reading, parse_json_file
+from relit.capture.listing import image_folder, listed
 from relit.capture.readers import mvmc
 from relit.errors import UserError, did_you_mean
 
@@ -77,7 +78,8 @@ def read(path: Path, found: Path) -> Reading:
             f"looked in image/ and images/ beside {QUADRANTS}",
             f"add them: {found}",
         )
-    photos = list_images(folder)
+    listing = listed(folder)
+    photos = listing.photos
     held = (
         set(_names(parse_json_file(found / HELD_OUT), found / HELD_OUT))
         if (found / HELD_OUT).is_file()
@@ -91,9 +93,15 @@ def read(path: Path, found: Path) -> Reading:
             fix=f"mend the file: {found / HELD_OUT}",
         )
     frames = tuple(
-        Frame(f, f.relative_to(found).as_posix(), held_out=f.name in held) for f in photos
+        Frame(
+            f,
+            f.relative_to(found).as_posix(),
+            mask=listing.masks.get(f),
+            held_out=f.name in held,
+        )
+        for f in photos
     )
-    return Reading("samurai", found, frames, kind="collection")
+    return Reading("samurai", found, frames, notes=listing.notes, kind="collection")
 
 
 def _names(content: dict, source: Path) -> list[str]:

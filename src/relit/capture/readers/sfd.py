@@ -8,9 +8,10 @@ labels       NAME_labels.png, NAME_instance_seg.png or NAME_seg.png beside the p
              black for the rest
 cut-outs     cutouts/*.png beside the photo (of several photos: cutouts/NAME/*.png): RGBA pictures
              of the photo's size, one for each object
-COCO         a .json with `images` and `annotations` (polygons or run lengths) beside the photo
-BOP          a scene's folder: scene_camera.json, scene_gt.json, rgb/, mask_visib/ or mask/; of
-             several objects the commonest
+COCO         a .json with `images` and `annotations` (polygons or run lengths) beside the photo, above
+             its images/, or in annotations/; labelme and VIA likewise (`capture.annotations`)
+BOP          a scene's folder: scene_camera.json, scene_gt.json, rgb/ or gray/, mask_visib/ or mask/;
+             of several objects the commonest
 
 Several photos with labels in one folder are photos of one pile: nothing stirs between them, and
 labels need not agree.
@@ -18,7 +19,6 @@ labels need not agree.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,15 +26,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from relit.capture.annotations import annotated_photos, annotations_of
 from relit.capture.corrections import corrected_labels
-from relit.capture.frames import (
-    check_max_side,
-    image_folder,
-    list_images,
-    parse_json_file,
-    pose_from,
+from relit.capture.frames import check_max_side, parse_json_file, pose_from
+from relit.capture.labels import (
+    BOP_TRUTH,
+    checked_labels,
+    cutouts_in,
+    read_labels,
+    which_objects,
 )
-from relit.capture.labels import BOP_TRUTH, checked_labels, read_labels, which_objects
+from relit.capture.listing import image_folder, list_images, pictures_in
 from relit.capture.networks import Network, found_instances
 from relit.capture.photo import Decoder
 from relit.conventions import world_from_cv_camera
@@ -45,6 +47,7 @@ from relit.scene import Camera, Capture, Photo, Pixels
 LOOKED_FOR = "a photo with NAME_labels.png, cut-outs, COCO or BOP labels beside it (SfD)"
 SUFFIXES = ("_instance_seg", "_labels", "_instances", "_seg")
 SFD_NORMALS = "_normal_pretrain.png"  # SfD's: y up, z towards the camera
+BOP_PHOTOS = ("rgb", "gray")  # folders of colour or grey photos
 CUTOUTS = ("cutouts", "cut-outs", "instances")
 FOCAL_GUESS = 1.2  # of the longer side, where neither the user nor the file tells
 MOST_PHOTOS = 12  # of one pile; of more, so many evenly spread
@@ -86,22 +89,17 @@ def recognise(path: Path) -> Source | None:
         return None if labels is None else Source(path.parent, path, labels, _cameras(path.parent))
     if not path.is_dir():
         return None
-    if (path / BOP_TRUTH).is_file() and (path / "rgb").is_dir():
-        photos = [f for f in sorted((path / "rgb").iterdir()) if f.suffix.lower() in EXTENSIONS]
-        return (
-            _source(path, [(f, path / BOP_TRUTH) for f in photos], path / "scene_camera.json")
-            if photos
-            else None
-        )
+    if (path / BOP_TRUTH).is_file():
+        photos = next((p for n in BOP_PHOTOS if (p := pictures_in(path / n))), [])
+        truth = path / BOP_TRUTH
+        cameras = path / "scene_camera.json"
+        return _source(path, [(f, truth) for f in photos], cameras) if photos else None
     for folder in (path / "train", path / "raw", path):
-        if folder.is_dir():
-            found = [
-                (f, labels)
-                for f in sorted(folder.iterdir())
-                if _is_photo(f) and (labels := _labels_of(f)) is not None
-            ]
-            if found:
-                return _source(path, found, _cameras(path))
+        photos = [f for f in pictures_in(folder) if _is_photo(f)]
+        found = [(f, labels) for f in photos if (labels := _labels_of(f, False)) is not None]
+        found = found or (annotated_photos(folder) if folder.is_dir() else [])
+        if found:
+            return _source(path, found, _cameras(path))
     return None
 
 
@@ -132,7 +130,8 @@ def _cameras(root: Path) -> Path | None:
     )
 
 
-def _labels_of(photo: Path) -> Path | None:
+def _labels_of(photo: Path, annotated: bool = True) -> Path | None:
+    """The labels of a photo. annotated: annotation files count as well."""
     stem = photo.stem.removesuffix("_rgb")
     for suffix in SUFFIXES:
         for end in (".png", ".tif", ".tiff", ".bmp"):
@@ -140,29 +139,9 @@ def _labels_of(photo: Path) -> Path | None:
                 return file
     for name in CUTOUTS:
         for folder in (photo.parent / name / stem, photo.parent / name):
-            if folder.is_dir() and any(folder.glob("*.png")):
+            if folder.is_dir() and cutouts_in(folder):
                 return folder
-    for file in sorted(photo.parent.glob("*.json")):
-        if file.stat().st_size < 64 << 20 and _is_coco(file, photo):
-            return file
-    return None
-
-
-def _is_coco(file: Path, photo: Path) -> bool:
-    """Whether the file is COCO's and speaks of the photo (or of one picture only)."""
-    try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
-    except (ValueError, OSError, RecursionError):
-        return False
-    if (
-        not isinstance(data, dict)
-        or not isinstance(data.get("annotations"), list)
-        or not isinstance(data.get("images"), list)
-    ):
-        return False
-    names = {Path(str(i.get("file_name", ""))).name for i in data["images"] if isinstance(i, dict)}
-    others = [f for f in photo.parent.iterdir() if f.name in names]
-    return photo.name in names or not others
+    return annotations_of(photo) if annotated else None
 
 
 def open_duplicates(

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from relit.capture.frames import Frame, Reading, parse_json_file, path_inside, pose_from
+from relit.capture.frames import Frame, Reading, parse_json_file, pose_from
+from relit.capture.listing import image_folders
+from relit.capture.names import NameIndex, path_inside
 from relit.conventions import world_from_cv_camera
 from relit.errors import UserError
 from relit.geometry.lens import FisheyeLens
@@ -53,23 +55,26 @@ def read(path: Path, found: Path) -> Reading:
     frames)."""
     root, notes = found.parent, []
     data = parse_json_file(found)
-    frames, missing = _frames(data, root, found)
-    test_names = {
-        str(n).replace("\\", "/").removeprefix("./") for n in _list(data.get("test_filenames"))
-    }
+    index = NameIndex(root)
+    frames, missing = _frames(data, index, found)
+    told = NameIndex(root)
+    test = {told.find(str(n), anywhere=False) for n in _list(data.get("test_filenames"))}
     frames = [
-        Frame(f.path, f.name, f.camera, f.lens, f.mask, f.held_out or f.name in test_names)
+        Frame(f.path, f.name, f.camera, f.lens, f.mask, f.held_out or f.path in test)
         for f in frames
     ]
     test = root / "transforms_test.json"
     if test.is_file() and test != found:
-        held, gone = _frames(parse_json_file(test), root, test)
+        held, gone = _frames(parse_json_file(test), index, test)
         frames += [Frame(f.path, f.name, f.camera, f.lens, f.mask, True) for f in held]
         if gone:
             notes.append(
                 f"{len(gone)} test photos named in {test.name} are not there and were left out"
             )
     _complain(found, frames, missing, notes)
+    notes += index.notes(f"photos of {found.name}")
+    if data.get("from_na") is True:
+        notes.append("the poses have OpenCV camera axes (from_na of NeuS2)")
     return Reading("transforms", root, tuple(frames), notes=tuple(notes))
 
 
@@ -95,8 +100,9 @@ def _list(value) -> list:
     return value if isinstance(value, list) else []
 
 
-def _frames(data: dict, root: Path, source: Path) -> tuple[list[Frame], list[str]]:
+def _frames(data: dict, index: NameIndex, source: Path) -> tuple[list[Frame], list[str]]:
     """-> (frames whose file is there, names whose file is not)."""
+    root = index.root
     entries = data.get("frames")
     if not isinstance(entries, list) or not entries:
         raise UserError(
@@ -127,21 +133,45 @@ def _frames(data: dict, root: Path, source: Path) -> tuple[list[Frame], list[str
                 f"write it again: {source}",
             )
         what = f"'{entry['file_path'][:200]}'"
-        pose = world_from_cv_camera(pose_from(entry.get("transform_matrix"), what, source))
-        file, aside = _image_file(path_inside(root, entry["file_path"], source), asides)
+        pose = pose_from(entry.get("transform_matrix"), what, source)
+        if data.get("from_na") is not True:  # NeuS2's own poses have OpenCV axes already
+            pose = world_from_cv_camera(pose)
+        file, aside = _image_file(entry["file_path"], index, asides, source)
         if file is None:
             missing.append(entry["file_path"])
             continue
         camera, lens = _camera({**data, **entry}, pose, file, what, source)
         mask = entry.get("mask_path")
-        mask = path_inside(root, mask, source) if isinstance(mask, str) and mask else None
+        mask = _mask_file(mask, index, source) if isinstance(mask, str) and mask else None
         found.append(Frame(file, file.relative_to(root).as_posix(), camera, lens, mask, aside))
     return found, missing
 
 
-def _image_file(wanted: Path, asides: list[Path]) -> tuple[Path | None, bool]:
+def _mask_file(name: str, index: NameIndex, source: Path) -> Path:
+    """The file of mask_path, be it there or not."""
+    return index.find(name, anywhere=False) or path_inside(index.root, name, source)
+
+
+def _image_file(
+    name: str, index: NameIndex, asides: list[Path], source: Path
+) -> tuple[Path | None, bool]:
     """The file that file_path means (its extension may be left out), and whether it lies in a
     folder of held-out photos."""
+    try:
+        wanted = path_inside(index.root, name, source)
+    except UserError:
+        file = index.find(name, (index.root, *image_folders(index.root)), anywhere=False)
+        if file is None:
+            raise
+        return file, file.parent in asides
+    file, aside = _by_suffix(wanted, asides)
+    if file is None:
+        file = index.find(name, (index.root, *image_folders(index.root)), anywhere=False)
+        aside = file is not None and file.parent in asides
+    return file, aside
+
+
+def _by_suffix(wanted: Path, asides: list[Path]) -> tuple[Path | None, bool]:
     for folder, aside in [
         (wanted.parent, False),
         *((d, True) for d in asides if d != wanted.parent),
@@ -176,6 +206,24 @@ def _number(
     return value
 
 
+def _with_matrix(data: dict, what: str, source: Path) -> dict:
+    """The entry with fl_x, fl_y, cx, cy of NeuS2's intrinsic_matrix, where it has one."""
+    if data.get("intrinsic_matrix") is None:
+        return data
+    try:
+        k = np.array(data["intrinsic_matrix"], dtype=np.float64)
+        named = {"fl_x": k[0, 0], "fl_y": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
+        if not np.isfinite(list(named.values())).all():
+            raise ValueError("not finite")
+    except (TypeError, ValueError, IndexError, OverflowError) as error:
+        raise UserError(
+            f"intrinsic_matrix of {what} is no matrix of numbers",
+            str(error)[:100],
+            f"write it again: {source}",
+        ) from None
+    return {**named, **{k: v for k, v in data.items() if v is not None}}
+
+
 def _camera(data: dict, pose: np.ndarray, file: Path, what: str, source: Path):
     """-> (Camera, lens or None) in the pixels that w and h declare, or the file's own where they
     are not given."""
@@ -186,7 +234,8 @@ def _camera(data: dict, pose: np.ndarray, file: Path, what: str, source: Path):
     w, h = number("w"), number("h")
     if w is None or h is None:
         header = read_header(file)
-        w, h = header.width, header.height
+        w, h = header.as_stored
+    data = _with_matrix(data, what, source)
     fx = number("fl_x") or number("focal")
     if not fx:
         angle = number("camera_angle_x")

@@ -1,0 +1,223 @@
+"""Where the masks of a capture come from: alpha channels, run lengths, mask files, a plain backdrop
+or a network."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from relit.capture import photo
+from relit.capture.frames import Reading
+from relit.errors import UserError
+from relit.images import Header, Image, read_small
+from relit.masks.files import FOLDERS, find_mask, index_masks, judge, read_counted
+from relit.masks.segment import segmenter
+from relit.masks.threshold import Backdrop, black_frame, find_backdrop
+from relit.scene import Photo
+
+SMALL = 256  # pixels, longest side of the copies that masks are judged on
+PANORAMA = "EQUIRECTANGULAR"  # COLMAP's model
+LOOKED_AT = 12  # photos that are looked at for a plain backdrop
+
+
+def masked(
+    reading: Reading, headers: list[Header], photos: list[Photo], wanted: str, notes: list[str]
+):
+    """-> (photos that know their masks, small masks (h, w) or None, True when the background is
+    black)."""
+    none = [None] * len(photos)
+    if wanted in ("auto", "alpha") and all(h.alpha for h in headers):
+        small = [
+            None if f.held_out else _small(p).alpha
+            for f, p in zip(reading.frames, photos, strict=True)
+        ]
+        if wanted == "alpha" or any((a < 0.5).any() for a in small if a is not None):
+            inverted, empty = judge(_named(reading, small), "the alpha channel")
+            if inverted:
+                why = "it is opaque at the border and clear in the middle"
+                raise UserError(
+                    "the alpha channel looks inverted", why, "invert it, or use --masks none"
+                )
+            _say_empty(empty, notes)
+            notes.append("masks come from the alpha channel; the photos are composited on black")
+            return [with_decoder(p, mask=True) for p in photos], small, True
+        notes.append("the alpha channel is opaque everywhere: it is no mask")
+    elif wanted == "alpha":
+        raise UserError(
+            f"{sum(not h.alpha for h in headers)} of {len(headers)} photos have no alpha channel",
+            fix="give mask files, or another kind of masks",
+        )
+    elif any(h.alpha for h in headers):
+        notes.append(
+            f"only {sum(h.alpha for h in headers)} of {len(headers)} photos have an alpha channel: it is not used as a mask"
+        )
+    if wanted in ("auto", "files") and any(f.runs for f in reading.frames):
+        return (*_from_runs(reading, photos, notes), False)
+    if wanted in ("auto", "files"):
+        result = _from_files(reading, photos, wanted == "files", notes)
+        if result is not None:
+            return result
+    if wanted in ("auto", "threshold"):
+        result = _from_backdrop(reading, photos, wanted == "threshold", notes)
+        if result is not None:
+            return result
+    if wanted.startswith("segment"):
+        mask_of = segmenter(*wanted.split(":", 1)[1:])
+        masked, small = [], []
+        for p in photos:
+            m = mask_of(p.load().rgb)
+            masked.append(photo.with_mask(p, m))
+            scale = min(1.0, SMALL / max(m.shape))
+            small.append(cv2.resize(m, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+        _say_empty(judge(_named(reading, small), "the segmenter")[1], notes)
+        notes.append("masks were found by the segmenter; look at them")
+        return masked, small, False
+    return photos, none, False
+
+
+def _named(reading: Reading, small: list) -> dict[str, np.ndarray]:
+    return {f.name: m for f, m in zip(reading.frames, small, strict=True) if m is not None}
+
+
+def _small(p: Photo) -> Image:
+    return read_small(p.load.path, SMALL, p.load.upright)
+
+
+def with_decoder(p: Photo, **changes) -> Photo:
+    return replace(p, load=replace(p.load, **changes))  # pyright: ignore[reportArgumentType]
+
+
+def _say_empty(empty: list[str], notes: list[str]) -> None:
+    if empty:
+        notes.append(
+            f"{len(empty)} photos have an empty mask and are not used, for example {empty[0]}"
+        )
+
+
+def _from_runs(reading: Reading, photos: list[Photo], notes: list[str]):
+    """(photos, small masks) of a format that holds its masks itself."""
+    lacking = [f.name for f in reading.frames if f.runs is None]
+    if lacking:
+        what = f"{len(lacking)} of {len(photos)} photos have no mask in the file, for example {lacking[0]}"
+        raise UserError(what, fix=f"add their run lengths, or use --masks none: {reading.root}")
+    masked = [with_decoder(p, mask=f.runs) for p, f in zip(photos, reading.frames, strict=True)]
+    small = [
+        _shrunk(photo.fitted_mask(f.runs.decode(), (p.height, p.width), p.load.orientation, f.name))
+        for p, f in zip(photos, reading.frames, strict=True)
+    ]
+    _say_empty(judge(_named(reading, small), "the run lengths")[1], notes)
+    notes.append("masks come from run lengths")
+    return masked, small
+
+
+def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
+    folder, index = index_masks(reading.root)
+    named = any(f.mask is not None for f in reading.frames)
+    files = [
+        f.mask
+        if f.mask is not None and f.mask.is_file()
+        else find_mask(f.path, reading.root, index)
+        for f in reading.frames
+    ]
+    missing = [
+        f.name for f, m in zip(reading.frames, files, strict=True) if m is None or not m.is_file()
+    ]
+    train = [f.name for f in reading.frames if not f.held_out]
+    if folder is None and not asked and not named and len(missing) == len(files):
+        return None
+    if set(missing) & set(train):
+        lacking = [n for n in missing if n in set(train)]
+        if folder is not None and folder.name.lower() not in FOLDERS and not asked and not named:
+            notes.append(
+                f"{folder.name}/ holds masks by its name and is not used: {len(lacking)} of "
+                f"{len(train)} photos have none there, for example {lacking[0]}"
+            )
+            return None
+        raise UserError(
+            f"{len(lacking)} of {len(train)} photos have no mask, for example {lacking[0]}",
+            f"masks were looked for in {folder.name}/ by the photos' names"
+            if folder
+            else "no mask folder was found and no file ends in _mask.png",
+            f"add the masks, or use --masks none: {folder or reading.root}",
+        )
+    looked = [
+        (None, False) if f.held_out else _small_mask(m, p)  # pyright: ignore[reportArgumentType]
+        for f, m, p in zip(reading.frames, files, photos, strict=True)
+    ]
+    small = [mask for mask, _ in looked]
+    where = f"{folder.name}/" if folder else "the mask files"
+    inverted, empty = judge(_named(reading, small), where)
+    small = [1.0 - m if inverted and m is not None else m for m in small]
+    notes.append(f"masks come from {where}")
+    if any(numbered for _, numbered in looked):
+        notes.append(
+            "the masks hold the numbers 0 and 1 in the place of black and white: 1 is taken for the object"
+        )
+    if inverted:
+        notes.append("the masks were white off the object and have been inverted")
+    _say_empty(empty, notes)
+    files = [
+        m if m is not None and m.is_file() else None for m in files
+    ]  # of a held-out photo it may be missing
+    return (
+        [with_decoder(p, mask=m, invert=inverted) for p, m in zip(photos, files, strict=True)],
+        small,
+        False,
+    )
+
+
+def _small_mask(path: Path, p: Photo) -> tuple[np.ndarray, bool]:
+    """Small copy of a mask file, and whether it holds the numbers 0 and 1 (`read_counted`)."""
+    mask, numbered = read_counted(path)
+    return _shrunk(photo.upright_mask(mask, (p.height, p.width), p.load.orientation)), numbered
+
+
+def _shrunk(mask: np.ndarray) -> np.ndarray:
+    h, w = mask.shape
+    s = min(1.0, SMALL / max(h, w))
+    return (
+        mask
+        if s == 1
+        else cv2.resize(
+            mask, (max(1, round(w * s)), max(1, round(h * s))), interpolation=cv2.INTER_AREA
+        )
+    )
+
+
+def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
+    training = [p for f, p in zip(reading.frames, photos, strict=True) if not f.held_out]
+    if not asked and any(getattr(f.lens, "model", "") == PANORAMA for f in reading.frames):
+        return None  # the border of a panorama is no backdrop
+    looked = [_small(p).rgb for p in training[:: max(1, len(training) // LOOKED_AT)]]
+    backdrop: Backdrop | None = find_backdrop(looked)
+    frame = black_frame(looked) if asked or backdrop is not None else None
+    if frame is not None:
+        said = f"a black frame covers {100 * frame:.0f} % of each photo (bars, a fisheye's circle, "
+        said += "edges of undistorted photos)"
+        if asked:
+            raise UserError(said, "it is no backdrop", "crop the photos, or give mask files")
+        notes.append(f"{said}: it is no backdrop and gives no masks; cropped photos are better")
+        return None
+    if backdrop is None:
+        if asked:
+            raise UserError(
+                "the photos do not stand before a plain backdrop",
+                "their borders are not of one colour",
+                "give mask files, or use --masks none to fit the background as well",
+            )
+        return None
+    small = [
+        None if f.held_out else backdrop(_small(p).rgb)
+        for f, p in zip(reading.frames, photos, strict=True)
+    ]
+    _, empty = judge(_named(reading, small), "the threshold")
+    _say_empty(empty, notes)
+    kind = "dark" if backdrop.dark else "plain"
+    notes.append(
+        f"masks were found by a threshold before the {kind} backdrop"
+        + ("; what lies outside them is set to black" if backdrop.dark else "")
+    )
+    return [with_decoder(p, mask=backdrop) for p in photos], small, backdrop.dark
