@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from relit.images import read_header, read_small, turn_upright
 from relit.masks.rle import Runs, runs_from
 
 MOST_BYTES = 64 << 20  # of an annotation file
-FOLDERS_OF_ANNOTATIONS = ("annotations", "annotation", "ann", "labels", "json")
+FOLDERS_OF_ANNOTATIONS = ("annotations", "annotation", "ann", "labels", "json", "labelme", "coco")
 NOT_ANNOTATIONS = ("transforms", "cam_dict", "scene_", "quadrants", "metadata", "cameras")
 SAME_SHAPE = 0.02  # relative difference of width / height that rounding explains
 SPILL = 2.0  # pixels by which corners may lie outside the picture
@@ -54,8 +55,16 @@ def parse_annotations(file: Path) -> dict | None:
     if file.name.startswith(NOT_ANNOTATIONS) or is_hidden(file):
         return None
     try:
-        if file.stat().st_size > MOST_BYTES:
-            return None
+        state = file.stat()
+    except OSError:
+        return None
+    return None if state.st_size > MOST_BYTES else _parsed(file, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=32)
+def _parsed(file: Path, changed: int, size: int) -> dict | None:
+    """`parse_annotations`, once for each state of a file."""
+    try:
         data = json.loads(file.read_text(encoding="utf-8-sig"))
     except (ValueError, OSError, RecursionError):
         return None
@@ -150,6 +159,31 @@ def annotated_photos(root: Path) -> list[tuple[Path, Path]]:
             lone = [f for d in bases if d.is_dir() for f in pictures_in(d)]
             found |= {lone[0]: file} if len(lone) == 1 else {}
     return sorted(found.items())
+
+
+def are_masks(annotated: list[tuple[Path, Path]]) -> bool:
+    """Whether the outlines are masks of one object seen from several sides: three photos or more,
+    and none shows two objects."""
+    if len(annotated) < 3:
+        return False
+    counts = []
+    for photo, file in annotated:
+        data = parse_annotations(file) or {"images": [], "annotations": []}
+        ids = {str(i.get("id")) for i in _images(data) if _names(i, photo)}
+        annotations = [a for a in data["annotations"] if isinstance(a, dict)]
+        counts.append(sum(str(a.get("image_id")) in ids for a in annotations))
+    return max(counts) == 1
+
+
+def outline_mask(file: Path, photo: Path) -> Runs:
+    """The union of the objects of a photo as run lengths, upright. Raises UserError as
+    `outlines_of` and `draw_outlines` do."""
+    header = read_header(photo)
+    labels = draw_outlines(outlines_of(file, photo), photo, (header.height, header.width))
+    flat = (labels.T.ravel() > 0).astype(np.int8)
+    ends = np.flatnonzero(np.diff(flat)) + 1
+    counts = np.diff(np.concatenate([[0], ends, [len(flat)]])).tolist()
+    return Runs(tuple([0, *counts] if flat[0] else counts), labels.shape, photo.name)  # pyright: ignore[reportArgumentType]
 
 
 def annotations_of(photo: Path) -> Path | None:

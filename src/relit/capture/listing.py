@@ -219,15 +219,14 @@ def _without_copies(files: list[Path]) -> tuple[list[Path], list[str]]:
     sizes: dict[int, list[Path]] = defaultdict(list)
     for f in files:
         sizes[f.stat().st_size].append(f)
-    seen: dict[bytes, Path] = {}
+    seen: set[bytes] = set()
     copies = []
     for group in sizes.values():
-        for f in group if len(group) > 1 else ():
+        for f in sorted(group, key=lambda f: (len(f.name), f.name)) if len(group) > 1 else ():
             digest = hashlib.sha256(f.read_bytes()).digest()
-            if digest in seen:
-                copies.append(f)
-            else:
-                seen[digest] = f
+            copies += [f] if digest in seen else []
+            seen.add(digest)
+    copies.sort()
     gone = set(copies)
     kept = [f for f in files if f not in gone]
     if copies and len(kept) < FEWEST:

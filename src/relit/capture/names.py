@@ -114,11 +114,12 @@ class NameIndex:
         for skipped in range(len(parts) if moved else 1):
             end = "/".join(parts[skipped:])
             for base in bases:
-                if skipped and (file := self._exact(end, (base,))) is not None:
+                cut = skipped or end != name.replace("\\", "/").removeprefix("./")
+                if cut and (file := self._exact(end, (base,))) is not None:
                     return self._noted("path", name, file)
                 found = self._by_key(self._keys, _relative(base, self.root, end))
                 if found is not None:
-                    rule = "path" if skipped else found[0]
+                    rule = "path" if cut else found[0]
                     return self._noted(rule, name, found[1])
         found = self._by_key(self._ends, parts[-1]) if moved else None
         if found is not None:

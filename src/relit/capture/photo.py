@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from relit.capture.annotations import annotated_photos, are_masks, outline_mask
 from relit.capture.frames import Frame, Reading
 from relit.capture.listing import (
     IMAGE_FOLDERS,
@@ -382,8 +383,16 @@ def read(path: Path, found: Path) -> Reading:
     """All photos of a folder, without cameras; one file of each (`capture.listing`)."""
     listing = listed(found, duplicates=True)
     files = listing.photos or tuple(in_rings(found))
+    annotated = annotated_photos(path)
+    outlines = dict(annotated) if are_masks(annotated) else {}
     frames = tuple(
-        Frame(f, f.relative_to(path).as_posix(), mask=listing.masks.get(f)) for f in files
+        Frame(
+            f,
+            f.relative_to(path).as_posix(),
+            mask=listing.masks.get(f),
+            runs=outline_mask(outlines[f], f) if f in outlines else None,
+        )
+        for f in files
     )
     return Reading("photos", path, frames, notes=(*listing.notes, *camera_traces(path)))
 

@@ -134,11 +134,8 @@ def _decoded(path: Path, image: PilImage.Image, orientation: int) -> Decoded:
         if array.dtype.kind == "f":  # floats are linear
             return Decoded(_finite(array, path), True)
         return Decoded(array, False, profile)
-    before = orientation_of(image)
-    if image.format == "TIFF":
-        image.load()  # most versions of Pillow turn a TIFF here
-        if before != 1 and image.getexif().get(0x0112, 1) == 1:
-            orientation = 1 if orientation == before else {6: 8, 8: 6}.get(before, before)
+    if image.format == "TIFF":  # Pillow turns it too, and mixes up the rows of some
+        image = PilImage.open(io.BytesIO(_as_stored(path.read_bytes())))
     if image.mode in ("P", "PA") or "transparency" in image.info:
         image = image.convert("RGBA")
     elif image.mode in ("1", "YCbCr", "HSV"):

@@ -12,6 +12,7 @@ from relit.capture.readers.colmap_binary import check_binary, without_observatio
 from relit.device import load_pycolmap
 
 PARTS = ("cameras", "images", "points3D")
+SPACE = "\x1f"  # stands for a space in a name: COLMAP's reader ends a name there
 NO_POINTS = {"bin": bytes(8), "txt": b"# no points\n"}  # a count of zero; no line
 
 
@@ -37,7 +38,7 @@ def load_model(folder: Path) -> tuple[object, list[str]]:
         content = without_observations(images.read_bytes())
     else:
         text, lacking = with_second_lines(images.read_text(encoding="utf-8"), complete)
-        if complete and not lacking:
+        if complete and not lacking and SPACE not in text:
             return pycolmap.Reconstruction(str(folder)), notes
         if lacking:
             notes.append(
@@ -55,8 +56,14 @@ def load_model(folder: Path) -> tuple[object, list[str]]:
         return pycolmap.Reconstruction(place), notes
 
 
+def name_of(image) -> str:
+    """The name of a pycolmap.Image of `load_model`."""
+    return image.name.replace(SPACE, " ")
+
+
 def with_second_lines(text: str, points: bool = True) -> tuple[str, int]:
-    """images.txt with two lines for each image, and how many had but one. points: keep the second
+    """images.txt with two lines for each image, and how many had but one; spaces in
+    names become SPACE. points: keep the second
     lines; else they are empty. Raises ValueError for a line that is neither."""
     out: list[str] = []
     lacking, waiting = 0, False
@@ -68,7 +75,7 @@ def with_second_lines(text: str, points: bool = True) -> tuple[str, int]:
             if waiting:
                 out.append("")
                 lacking += 1
-            out.append(line)
+            out.append(" ".join(words[:9]) + " " + SPACE.join(line.split(maxsplit=9)[9].split(" ")))
             waiting = True
         elif waiting and (not words or _is_points(words)):
             out.append(line if points else "")

@@ -14,7 +14,7 @@ import numpy as np
 from relit.capture.frames import Frame, Reading
 from relit.capture.listing import image_folders
 from relit.capture.names import NameIndex, path_inside
-from relit.capture.readers.colmap_complete import load_model, model_ending
+from relit.capture.readers.colmap_complete import load_model, model_ending, name_of
 from relit.device import load_pycolmap
 from relit.errors import UserError
 from relit.geometry.lens import FisheyeLens, Lens
@@ -136,7 +136,7 @@ def _located(path: Path, folder: Path) -> Located:
     """Load a model and find its photos."""
     try:
         model, notes = load_model(folder)
-        images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda i: i.name)  # pyright: ignore[reportAttributeAccessIssue]
+        images = sorted((model.image(i) for i in model.reg_image_ids()), key=name_of)  # pyright: ignore[reportAttributeAccessIssue]
     except (RuntimeError, ValueError, IndexError, MemoryError, OSError, struct.error) as error:
         raise _unusable("read", error, folder) from error
     root = path
@@ -152,12 +152,12 @@ def _located(path: Path, folder: Path) -> Located:
     ]
     bases = [d for p in places for d in image_folders(p) if d != p] or [root]
     index = NameIndex(root)
-    files = [index.find(i.name, bases, anywhere=False) for i in images]
+    files = [index.find(name_of(i), bases, anywhere=False) for i in images]
     if not any(files):  # of photos that are partly there no others are taken
-        files = [index.find(i.name, bases) for i in images]
+        files = [index.find(name_of(i), bases) for i in images]
     for image, file in zip(images, files, strict=True):
         if file is None:
-            path_inside(bases[0], image.name, folder)
+            path_inside(bases[0], name_of(image), folder)
     pairs = tuple(zip(images, files, strict=True))
     return Located(model, folder, root, bases[0], pairs, index, tuple(notes))
 
@@ -166,7 +166,7 @@ def _frames(located: Located, notes: list[str]) -> list[Frame]:
     root, frames, missing = located.root, [], []
     for image, file in located.files:
         if file is None:
-            missing.append(image.name)
+            missing.append(name_of(image))
             continue
         camera, lens = camera_from_colmap(image.camera, world_from_camera(image))
         numbers = [

@@ -26,7 +26,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from relit.capture.annotations import annotated_photos, annotations_of
+from relit.capture.annotations import annotated_photos, annotations_of, are_masks
 from relit.capture.corrections import corrected_labels
 from relit.capture.frames import check_max_side, parse_json_file, pose_from
 from relit.capture.labels import (
@@ -97,7 +97,9 @@ def recognise(path: Path) -> Source | None:
     for folder in (path / "train", path / "raw", path):
         photos = [f for f in pictures_in(folder) if _is_photo(f)]
         found = [(f, labels) for f in photos if (labels := _labels_of(f, False)) is not None]
-        found = found or (annotated_photos(folder) if folder.is_dir() else [])
+        if not found and folder.is_dir():
+            found = annotated_photos(folder)
+            found = [] if are_masks(found) else found
         if found:
             return _source(path, found, _cameras(path))
     return None
@@ -153,9 +155,11 @@ def open_duplicates(
     photos, objects = [], 0
     for path, labels in ((source.photo, source.labels), *source.more):
         header = read_header(path)
-        own, dropped = usable_labels(
-            read_labels(labels, path, (header.height, header.width)), labels, source.root, path
-        )
+        numbers = read_labels(labels, path, (header.height, header.width))
+        if source.more and not numbers.any() and (photos or path != source.more[-1][0]):
+            notes.append(f"{path.name} shows no object of {labels.name} and is left out")
+            continue
+        own, dropped = usable_labels(numbers, labels, source.root, path)
         named = f"{path.name}: " if source.more else ""
         count = len(np.unique(own[own > 0]))
         notes += [named + note for note in (*dropped, f"{count} objects in {labels.name}")]
@@ -163,7 +167,7 @@ def open_duplicates(
         photos.append(labelled_photo(source, path, header, own, focal, max_side, notes))
     if (told := which_objects(source.labels, source.photo)) is not None:
         notes.append(told)
-    if source.more:
+    if len(photos) > 1:
         notes.append(f"{len(photos)} photos of one pile: nothing must stir between them")
     return Capture(
         source.root,
