@@ -157,6 +157,7 @@ BESIDE = (
     "cut-outs",
     "instances",
     "mask_visib",
+    "annotations",
 )
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from relit.capture.annotations import edge_strength
 from relit.capture.listing import listed, photo_folders
+from relit.capture.mask_edges import edge_strength
 from relit.capture.names import NameIndex
 from relit.capture.open import open_capture
 from relit.errors import UserError
-from relit.images import turn_upright
+from relit.images import read_image, turn_upright, write_data
 from support import camera_ring
 
 APPLE_DOUBLE = bytes.fromhex("00051607000200004d6163204f532058") + bytes(100)
@@ -144,6 +144,30 @@ def test_cameras_of_the_upright_picture_keep_it(tmp_path, cameras, orientation):
     colmap(tmp_path, cameras, names)
     capture = open_capture(tmp_path, masks="none")
     assert sum(camera_ring.check_projection(p) for p in capture.photos) > COUNT
+
+
+@pytest.mark.parametrize("orientation", [2, 3, 4])
+@pytest.mark.parametrize("made_of", ["stored", "upright"])
+@pytest.mark.parametrize("known", [True, False])
+def test_masks_of_a_photo_upside_down(tmp_path, cameras, orientation, made_of, known):
+    """Neither tool nor shape tells whether a mask was made from the pixels as stored or from the
+    upright picture: the edges of the photos do."""
+    names = photos(tmp_path / "images", cameras, suffix=".jpg")
+    (tmp_path / "masks").mkdir()
+    for name, camera in zip(names, cameras, strict=True):
+        stored = np.array(Image.open(tmp_path / "images" / name))
+        turned(tmp_path / "images" / name, orientation, stored)
+        mask = camera_ring.picture(camera)[1]
+        mask = mask if made_of == "stored" else turn_upright(mask, orientation)
+        write_data(tmp_path / "masks" / name.replace("jpg", "png"), mask)
+    if known:
+        colmap(tmp_path, cameras, names)
+    capture = open_capture(tmp_path)
+    for photo, camera in zip(capture.photos, cameras, strict=True):
+        expected = camera_ring.picture(camera)[1]
+        expected = expected if known else turn_upright(expected, orientation)
+        assert np.abs(photo.load().mask - expected).mean() < 0.01
+    assert any("masks were turned" in n for n in capture.notes) == (known != (made_of == "stored"))
 
 
 # ---------------------------------------------------------------- what is passed over
@@ -504,8 +528,8 @@ def test_annotations_of_a_photo_on_its_side(tmp_path, orientation, corners, size
     given = (W, H) if size == "upright" else (H, W)
     (tmp_path / "a.json").write_text(json.dumps(coco_of(drawn, "a.jpg", given)))
     same_labels(tmp_path, labels)
-    right = edge_strength(tmp_path / "a.jpg", labels.astype(np.int32))
-    assert right > edge_strength(tmp_path / "a.jpg", labels[::-1].astype(np.int32))
+    rgb = read_image(tmp_path / "a.jpg").rgb
+    assert edge_strength(rgb, labels) > edge_strength(rgb, labels[::-1])
 
 
 def test_labels_of_the_pixels_as_stored_are_turned(tmp_path):

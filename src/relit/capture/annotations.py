@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from relit.capture.listing import image_folders, pictures_in
+from relit.capture.mask_edges import CLEARER, edge_strength
 from relit.capture.names import NameIndex, before_upload, folded, is_hidden, plain_parts, stem_of
 from relit.errors import UserError
 from relit.images import read_header, read_small, turn_upright
@@ -29,7 +30,6 @@ FOLDERS_OF_ANNOTATIONS = ("annotations", "annotation", "ann", "labels", "json", 
 NOT_ANNOTATIONS = ("transforms", "cam_dict", "scene_", "quadrants", "metadata", "cameras")
 SAME_SHAPE = 0.02  # relative difference of width / height that rounding explains
 SPILL = 2.0  # pixels by which corners may lie outside the picture
-CLEARER = 1.25  # times stronger edges along the outlines that decide between two orientations
 EDGE_SIDE = 512  # pixels, longest side at which edges are looked at
 
 
@@ -334,7 +334,8 @@ def draw_outlines(outlines: Outlines, photo: Path, shape: tuple[int, int]) -> np
     drawn = [view(outlines) for view in views]
     if len(drawn) == 1:
         return drawn[0]
-    strength = [edge_strength(photo, labels) for labels in drawn]
+    rgb = read_small(photo, EDGE_SIDE).rgb
+    strength = [edge_strength(rgb, labels) for labels in drawn]
     best = int(np.argmax(strength))
     if strength[best] < CLEARER * max(s for k, s in enumerate(strength) if k != best):
         raise UserError(
@@ -389,14 +390,3 @@ def _drawn(outlines: Outlines, size: tuple[float, float], shape: tuple[int, int]
         for polygon in s:  # one by one: drawn together their overlap would be a hole
             cv2.fillPoly(labels, [np.round(polygon * scale).astype(np.int32)], k)
     return labels
-
-
-def edge_strength(photo: Path, labels: np.ndarray) -> float:
-    """How much stronger the photo's edges are along the borders of the labels (H, W) than
-    elsewhere."""
-    gray = np.sqrt(read_small(photo, EDGE_SIDE).rgb.mean(axis=-1))
-    small = cv2.resize(labels, gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
-    border = cv2.dilate(cv2.Laplacian(small.astype(np.float32), cv2.CV_32F) ** 2, np.ones((3, 3)))
-    along = border > 0
-    return float(slope[along].mean() / max(slope.mean(), 1e-9)) if along.any() else 0.0

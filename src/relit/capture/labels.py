@@ -11,9 +11,10 @@ import numpy as np
 from relit.capture.annotations import draw_outlines, outlines_of
 from relit.capture.frames import parse_json_file
 from relit.capture.listing import pictures_in
+from relit.capture.mask_edges import is_turned
 from relit.capture.photo import upright_mask
 from relit.errors import UserError
-from relit.images import read_header
+from relit.images import read_header, read_small, turn_upright
 from relit.images.opencv import decode_file
 
 LEAST_SIDE = 24  # pixels; smaller objects carry no pose
@@ -37,7 +38,10 @@ def read_labels(source: Path, photo: Path, shape: tuple[int, int]) -> np.ndarray
             "it is damaged or no picture",
             f"write it again: {source}",
         )
-    labels = upright_mask(_numbers(data), shape, read_header(photo).orientation)
+    turn = read_header(photo).orientation
+    labels = upright_mask(_numbers(data), shape, turn)
+    if turn != 1 and is_turned([(read_small(photo).rgb, labels, turn)]):
+        labels = turn_upright(labels, turn)
     if labels.shape != shape:
         if (
             abs(labels.shape[1] / labels.shape[0] - shape[1] / shape[0])

@@ -11,8 +11,9 @@ import numpy as np
 
 from relit.capture import photo
 from relit.capture.frames import Reading
+from relit.capture.mask_edges import is_turned
 from relit.errors import UserError
-from relit.images import Header, Image, read_small
+from relit.images import Header, Image, read_small, turn_upright
 from relit.masks.files import FOLDERS, find_mask, index_masks, judge, read_counted
 from relit.masks.segment import segmenter
 from relit.masks.threshold import Backdrop, black_frame, find_backdrop
@@ -149,9 +150,19 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
     ]
     small = [mask for mask, _ in looked]
     where = f"{folder.name}/" if folder else "the mask files"
+    turn = _to_turn(photos, small)
+    small = [
+        turn_upright(m, p.load.orientation) if t and m is not None else m  # pyright: ignore[reportAttributeAccessIssue]
+        for m, p, t in zip(small, photos, turn, strict=True)
+    ]
     inverted, empty = judge(_named(reading, small), where)
     small = [1.0 - m if inverted and m is not None else m for m in small]
     notes.append(f"masks come from {where}")
+    if any(turn):
+        notes.append(
+            f"{sum(turn)} masks were turned by the EXIF orientation of their photos: they lie on "
+            "their edges so"
+        )
     if any(numbered for _, numbered in looked):
         notes.append(
             "the masks hold the numbers 0 and 1 in the place of black and white: 1 is taken for the object"
@@ -162,11 +173,26 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
     files = [
         m if m is not None and m.is_file() else None for m in files
     ]  # of a held-out photo it may be missing
-    return (
-        [with_decoder(p, mask=m, invert=inverted) for p, m in zip(photos, files, strict=True)],
-        small,
-        False,
-    )
+    masked_photos = [
+        with_decoder(p, mask=m, invert=inverted, turn_mask=t)
+        for p, m, t in zip(photos, files, turn, strict=True)
+    ]
+    return masked_photos, small, False
+
+
+def _to_turn(photos: list[Photo], small: list[np.ndarray | None]) -> list[bool]:
+    """Of which photos the masks are turned though their shape does not ask for it: all that EXIF
+    turns by half or mirrors (or that are square), or none."""
+    may = [
+        m is not None
+        and p.load.orientation != 1
+        and turn_upright(m, p.load.orientation).shape == m.shape  # pyright: ignore[reportAttributeAccessIssue]
+        for p, m in zip(photos, small, strict=True)
+    ]
+    looked = [k for k, possible in enumerate(may) if possible]
+    looked = looked[:: max(1, len(looked) // LOOKED_AT)]
+    pairs = [(_small(photos[k]).rgb, small[k], photos[k].load.orientation) for k in looked]  # pyright: ignore[reportAttributeAccessIssue]
+    return may if is_turned(pairs) else [False] * len(may)  # pyright: ignore[reportArgumentType]
 
 
 def _small_mask(path: Path, p: Photo) -> tuple[np.ndarray, bool]:

@@ -45,6 +45,7 @@ class Decoder:
     mask: a file, run lengths, a backdrop, True for the file's own alpha channel, or None. invert:
     the mask file is white off the object.
     orientation: the photo's in EXIF, for masks that were made from the pixels as stored.
+    turn_mask: apply it to the mask though its shape is that of the photo.
     """
 
     path: Path
@@ -54,6 +55,7 @@ class Decoder:
     invert: bool = False
     normal: Path | None = None
     orientation: int = 1
+    turn_mask: bool = False
 
     def __call__(self) -> Pixels:
         image = read_image(self.path, self.upright)
@@ -64,6 +66,7 @@ class Decoder:
             mask = image.alpha
         elif isinstance(self.mask, Path):
             mask = file_mask(self.mask, shape, self.invert, self.orientation)
+            mask = turn_upright(mask, self.orientation) if self.turn_mask else mask
         elif isinstance(self.mask, Runs):
             mask = fitted_mask(
                 self.mask.decode(), shape, self.orientation, f"the runs of '{self.mask.name}'"
