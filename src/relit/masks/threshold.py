@@ -13,6 +13,7 @@ BAND = 0.03  # width of the border that is looked at, as a share of the shorter 
 BLACK = 0.05  # sRGB value below which a pixel holds no picture: bars, edges of undistorted photos
 FRAME = 0.005  # share of a picture that a black frame covers at least
 ROUND = 0.93  # share of its convex hull that the picture inside a black frame fills
+CENTRED = 0.02  # of the picture: twice the distance of a window from its middle
 FILLED = 0.6  # share of the pixels inside the frame's edge that are not black
 MOST_SHADOW = 0.2  # share of the photos in which they may be
 DARK = 0.12  # sRGB value below which a backdrop counts as dark
@@ -89,7 +90,7 @@ def black_frame(photos: list[np.ndarray]) -> float | None:
     edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     dead = np.isin(labels, edge[edge > 0])
     live = ~dead
-    if dead.mean() < FRAME or live.mean() < 0.1 or not (_is_around(dead) and _is_framed(live)):
+    if dead.mean() < FRAME or live.mean() < 0.02 or not (_is_around(dead) and _is_framed(live)):
         return None
     near = cv2.dilate(dead.astype(np.uint8), np.ones((5, 5)))  # blurred by JPEG and resampling
     ring = live & (cv2.dilate(near, np.ones((7, 7))) > 0) & (near == 0)
@@ -109,7 +110,8 @@ def _is_around(dead: np.ndarray) -> bool:
 
 def _is_framed(live: np.ndarray) -> bool:
     """Whether an area (h, w) has the shape of a picture inside a black frame: convex or nearly so,
-    and as large as the photo in one direction; or a rectangle that is most of the photo."""
+    and as large as the photo in one direction; a rectangle that is most of the photo; or a window
+    in the very middle, the same upside down."""
     contours, _ = cv2.findContours(live.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     largest = max(contours, key=cv2.contourArea)
     x, y, bw, bh = cv2.boundingRect(largest)
@@ -117,7 +119,15 @@ def _is_framed(live: np.ndarray) -> bool:
     area, hull = cv2.contourArea(largest), cv2.contourArea(cv2.convexHull(largest))
     across = (x <= 2 and x + bw >= w - 2) or (y <= 2 and y + bh >= h - 2)
     box = area > 0.97 * (bw - 1) * (bh - 1) and area > 0.4 * h * w
-    return area > ROUND * max(hull, 1.0) and (across or box)
+    filled = area / max((bw - 1) * (bh - 1), 1)
+    middle = abs(2 * x + bw - w) <= CENTRED * w and abs(2 * y + bh - h) <= CENTRED * h
+    window = middle and filled > 0.9 and _same_upside_down(live[y : y + bh, x : x + bw])
+    return area > ROUND * max(hull, 1.0) and (across or box or window)
+
+
+def _same_upside_down(area: np.ndarray) -> bool:
+    other = area[::-1, ::-1]
+    return bool((area & other).sum() > 0.97 * (area | other).sum())
 
 
 def _smoothed(rgb: np.ndarray) -> np.ndarray:
