@@ -105,6 +105,20 @@ def test_ambiguous_names_are_not_guessed(tmp_path):
     assert index.find("../../etc/passwd") is None and index.find("\0") is None
 
 
+@pytest.mark.parametrize("wanted", [0, 2])
+def test_cameras_of_duplicates_are_found_by_name(tmp_path, wanted):
+    """Of several frames the photo's own, named by a path of Windows in another letter case."""
+    codes, labels = scene()
+    Image.fromarray(codes).save(tmp_path / f"Kfz_{wanted}.png")
+    Image.fromarray(labels).save(tmp_path / f"kfz_{wanted}_Labels.PNG")
+    frames = [
+        {"file_path": f"C:\\x\\kfz_{k}.jpg", "fl_x": 100.0 + k, "w": W, "h": H} for k in range(3)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    capture = open_capture(tmp_path / f"Kfz_{wanted}.png")
+    assert capture.photos[0].camera.fx == 100.0 + wanted and capture.objects == 4
+
+
 # ---------------------------------------------------------------- orientation
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from relit.capture import photo
 from relit.capture.frames import Reading
+from relit.capture.listing import listed
 from relit.capture.mask_edges import is_turned
 from relit.errors import UserError
 from relit.images import Header, Image, read_small, turn_upright
@@ -115,7 +116,9 @@ def _from_runs(reading: Reading, photos: list[Photo], notes: list[str]):
 
 
 def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
-    folder, index = index_masks(reading.root)
+    places = {f.path.parent.parent for f in reading.frames}
+    inside = tuple(sorted(p for p in places if p.is_relative_to(reading.root)))
+    folder, index = index_masks(reading.root, inside)
     named = any(f.mask is not None for f in reading.frames)
     files = [
         f.mask
@@ -123,6 +126,8 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
         else find_mask(f.path, reading.root, index)
         for f in reading.frames
     ]
+    if not any(files):
+        files = _lying_beside(reading)
     missing = [
         f.name for f, m in zip(reading.frames, files, strict=True) if m is None or not m.is_file()
     ]
@@ -178,6 +183,16 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
         for p, m, t in zip(photos, files, turn, strict=True)
     ]
     return masked_photos, small, False
+
+
+def _lying_beside(reading: Reading) -> list[Path | None]:
+    """Cut-outs and masks with the names of the photos beside them, where all training photos have
+    one."""
+    folders = {f.path.parent for f in reading.frames}
+    beside = {p: m for d in folders for p, m in listed(d).masks.items()}
+    found = [beside.get(f.path) for f in reading.frames]
+    all_there = all(m or f.held_out for f, m in zip(reading.frames, found, strict=True))
+    return found if all_there else [None] * len(found)
 
 
 def _to_turn(photos: list[Photo], small: list[np.ndarray | None]) -> list[bool]:

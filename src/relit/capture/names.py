@@ -51,6 +51,13 @@ def stem_of(name: str) -> str:
     return stem if dot and "." + end.lower() in EXTENSIONS else name
 
 
+def stem_key(name: str) -> str:
+    """What names of one photo share: the file name without folders, extension, Unicode form and
+    letter case."""
+    parts = plain_parts(name)
+    return folded(stem_of(parts[-1])) if parts else ""
+
+
 def plain_parts(name: str) -> tuple[str, ...]:
     """The parts of a path of any system without drive, root, '.' and what leads upwards."""
     name = re.sub(r"^(file:/+|[A-Za-z]:)", "", name.replace("\\", "/"))

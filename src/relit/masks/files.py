@@ -61,10 +61,12 @@ def _masks_beside(folder: Path, changed: int) -> dict[str, Path]:
     return out
 
 
-def index_masks(root: Path) -> tuple[Path | None, dict[str, Path]]:
+def index_masks(root: Path, places: tuple[Path, ...] = ()) -> tuple[Path | None, dict[str, Path]]:
     """The mask folder of a capture (or None) and its files by relative name, name, stem (without
-    what says that it is a mask) and number."""
-    for base in dict.fromkeys([root, root.parent if root.name.lower() in PHOTO_FOLDERS else root]):
+    what says that it is a mask) and number. places: further folders in which a mask folder may
+    lie."""
+    above = (root.parent,) if root.name.lower() in PHOTO_FOLDERS else ()
+    for base in dict.fromkeys([root, *above, *places]):
         for folder in mask_folders(base):
             files = sorted(
                 f

@@ -15,6 +15,7 @@ from relit.capture.open import open_capture
 from relit.capture.readers.colmap_complete import with_second_lines
 from relit.capture.readers.colmap_model import camera_from_colmap
 from relit.errors import UserError
+from relit.images import write_data
 from support import camera_ring
 
 W, H = 96, 64
@@ -142,6 +143,28 @@ def test_photos_without_a_camera_are_named(project, cameras):
     capture = open_capture(project, masks="none")
     same(capture, cameras)
     assert any("1 photos have no camera" in n and "extra.png" in n for n in capture.notes)
+
+
+def test_cut_outs_beside_photos_with_cameras_are_masks(tmp_path, cameras):
+    names = camera_ring.write_photos(tmp_path / "images", cameras, suffix=".jpg")
+    camera_ring.write_photos(tmp_path / "images", cameras, suffix=".png", alpha=True)
+    camera_ring.write_colmap_text(tmp_path / "sparse" / "0", cameras, names)
+    capture = open_capture(tmp_path)
+    assert [p.name for p in capture.photos] == [f"images/{n}" for n in names]
+    mask = camera_ring.picture(cameras[1])[1]
+    assert np.abs(capture.photos[1].load().mask - mask).mean() < 0.01
+    assert not any("no camera" in n for n in capture.notes)
+
+
+def test_masks_of_a_workspace(tmp_path, cameras):
+    dense = tmp_path / "dense" / "0"
+    names = camera_ring.write_photos(dense / "images", cameras, background=camera_ring.BACKGROUND)
+    camera_ring.write_colmap_text(dense / "sparse", cameras, names)
+    (dense / "masks").mkdir()
+    for name, camera in zip(names, cameras, strict=True):
+        write_data(dense / "masks" / f"{name}.png", camera_ring.picture(camera)[1])
+    capture = open_capture(tmp_path)
+    assert capture.photos[0].load().mask is not None
 
 
 def test_the_images_folder_of_a_project(project, cameras):

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from relit.capture.frames import Frame, Reading, parse_json_file, pose_from, read_text
-from relit.capture.listing import list_images
+from relit.capture.listing import list_images, pictures_in
+from relit.capture.names import stem_key
 from relit.conventions import cv_from_mitsuba_axes
 from relit.errors import UserError
 from relit.scene import Camera, Sphere
@@ -52,8 +53,8 @@ def read(path: Path, found: Path) -> Reading:
 
 def _frames(file: Path, root: Path, held_out: bool) -> list[Frame]:
     content, folder = parse_json_file(file), file.parent / "image"
-    photos = {p.stem: p for p in list_images(folder)}
-    entries = {Path(name).stem: entry for name, entry in content.items()}
+    photos = {stem_key(p.name): p for p in list_images(folder)}
+    entries = {stem_key(name): entry for name, entry in content.items()}
     if not entries or set(photos) != set(entries):
         odd = sorted(set(photos) ^ set(entries))
         raise UserError(
@@ -65,11 +66,7 @@ def _frames(file: Path, root: Path, held_out: bool) -> list[Frame]:
     frames = []
     for stem in sorted(entries):
         mask = next(
-            (
-                m
-                for m in (file.parent / "mask" / f"{stem}{s}" for s in (".png", ".jpg"))
-                if m.is_file()
-            ),
+            (m for m in pictures_in(file.parent / "mask") if stem_key(m.name) == stem),
             None,
         )
         name = photos[stem].relative_to(root).as_posix()

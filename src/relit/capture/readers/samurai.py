@@ -21,6 +21,7 @@ import numpy as np
 from relit import files
 from relit.capture.frames import Frame, Reading, parse_json_file
 from relit.capture.listing import image_folder, listed
+from relit.capture.names import stem_key
 from relit.capture.readers import mvmc
 from relit.errors import UserError, did_you_mean
 
@@ -85,7 +86,9 @@ def read(path: Path, found: Path) -> Reading:
         if (found / HELD_OUT).is_file()
         else set()
     )
-    missing = held - {f.name for f in photos}
+    names = {stem_key(f.name) for f in photos}
+    missing = {n for n in held if stem_key(n) not in names}
+    held = {stem_key(n) for n in held}
     if missing:
         name = sorted(missing)[0]
         raise UserError(
@@ -97,7 +100,7 @@ def read(path: Path, found: Path) -> Reading:
             f,
             f.relative_to(found).as_posix(),
             mask=listing.masks.get(f),
-            held_out=f.name in held,
+            held_out=stem_key(f.name) in held,
         )
         for f in photos
     )
@@ -151,14 +154,13 @@ def _quadrants(path: Path, names: list[str]) -> Hints:
                 f"make it again with `relit quadrants`: {path}",
             )
         said[Path(name).name] = direction_of(answers, name, path)  # pyright: ignore[reportArgumentType]
-    known = {Path(n).name: n for n in names}
-    stems = {Path(n).stem: n for n in names}
+    known = {stem_key(n): n for n in names}
     directions = {}
     for name, direction in said.items():
-        if direction is not None and (name in known or Path(name).stem in stems):
-            directions[known.get(name, stems.get(Path(name).stem))] = direction
+        if direction is not None and stem_key(name) in known:
+            directions[known[stem_key(name)]] = direction
     if len(directions) < 0.5 * len(names):
-        strange = next((n for n in said if n not in known and Path(n).stem not in stems), "none")
+        strange = next((n for n in said if stem_key(n) not in known), "none")
         raise UserError(
             f"quadrants.json answers for {len(directions)} of {len(names)} photos",
             f"its names are matched with those of the photos; not among them is '{strange}'",

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,7 @@ from relit.capture.labels import (
     which_objects,
 )
 from relit.capture.listing import image_folder, list_images, pictures_in
+from relit.capture.names import folded, stem_key
 from relit.capture.networks import Network, found_instances
 from relit.capture.photo import Decoder
 from relit.conventions import world_from_cv_camera
@@ -135,15 +137,24 @@ def _cameras(root: Path) -> Path | None:
 def _labels_of(photo: Path, annotated: bool = True) -> Path | None:
     """The labels of a photo. annotated: annotation files count as well."""
     stem = photo.stem.removesuffix("_rgb")
+    beside = _by_key(photo.parent, photo.parent.stat().st_mtime_ns)
     for suffix in SUFFIXES:
         for end in (".png", ".tif", ".tiff", ".bmp"):
-            if (file := photo.parent / f"{stem}{suffix}{end}").is_file():
+            if (file := beside.get(folded(f"{stem}{suffix}{end}"))) is not None:
                 return file
     for name in CUTOUTS:
-        for folder in (photo.parent / name / stem, photo.parent / name):
+        top = beside.get(name)
+        for folder in (top / stem, top) if top is not None else ():
             if folder.is_dir() and cutouts_in(folder):
                 return folder
     return annotations_of(photo) if annotated else None
+
+
+@lru_cache(maxsize=8)
+def _by_key(folder: Path, changed: int) -> dict[str, Path]:
+    """What lies in a folder by its name in one Unicode form and letter case. changed: the folder's
+    time of change."""
+    return {folded(f.name): f for f in sorted(folder.iterdir())}
 
 
 def open_duplicates(
@@ -298,9 +309,9 @@ def _camera(
         if isinstance(data.get("frames"), list)
         else []
     )
-    stem = photo.stem.removesuffix("_rgb")
+    stem = stem_key(photo.name).removesuffix("_rgb")
     frame = next(
-        (f for f in frames if Path(str(f.get("file_path", ""))).stem.removesuffix("_rgb") == stem),
+        (f for f in frames if stem_key(str(f.get("file_path", ""))).removesuffix("_rgb") == stem),
         frames[0] if frames else {},
     )
     pose = (
