@@ -115,33 +115,36 @@ def _from_runs(reading: Reading, photos: list[Photo], notes: list[str]):
     return masked, small
 
 
-def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
+def _mask_files(reading: Reading) -> tuple[Path | None, list[Path | None]]:
+    """-> (the mask folder or None, of each frame its mask file or None)."""
     places = {f.path.parent.parent for f in reading.frames}
     inside = tuple(sorted(p for p in places if p.is_relative_to(reading.root)))
     folder, index = index_masks(reading.root, inside)
-    named = any(f.mask is not None for f in reading.frames)
+    named = [f.mask if f.mask is not None and f.mask.is_file() else None for f in reading.frames]
     files = [
-        f.mask
-        if f.mask is not None and f.mask.is_file()
-        else find_mask(f.path, reading.root, index)
-        for f in reading.frames
+        m or find_mask(f.path, reading.root, index)
+        for f, m in zip(reading.frames, named, strict=True)
     ]
-    if not any(files):
-        files = _lying_beside(reading)
-    missing = [
-        f.name for f, m in zip(reading.frames, files, strict=True) if m is None or not m.is_file()
-    ]
+    files = files if any(files) else _lying_beside(reading)
+    return folder, [m if m is not None and m.is_file() else None for m in files]
+
+
+def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[str]):
+    folder, files = _mask_files(reading)
+    wanted = asked or any(f.mask is not None for f in reading.frames)
     train = [f.name for f in reading.frames if not f.held_out]
-    if folder is None and not asked and not named and len(missing) == len(files):
+    lacking = [
+        f.name for f, m in zip(reading.frames, files, strict=True) if m is None and not f.held_out
+    ]
+    if folder is None and not wanted and not any(files):
         return None
-    if set(missing) & set(train):
-        lacking = [n for n in missing if n in set(train)]
-        if folder is not None and folder.name.lower() not in FOLDERS and not asked and not named:
-            notes.append(
-                f"{folder.name}/ holds masks by its name and is not used: {len(lacking)} of "
-                f"{len(train)} photos have none there, for example {lacking[0]}"
-            )
-            return None
+    if lacking and folder is not None and folder.name.lower() not in FOLDERS and not wanted:
+        notes.append(
+            f"{folder.name}/ holds masks by its name and is not used: {len(lacking)} of "
+            f"{len(train)} photos have none there, for example {lacking[0]}"
+        )
+        return None
+    if lacking:
         raise UserError(
             f"{len(lacking)} of {len(train)} photos have no mask, for example {lacking[0]}",
             f"masks were looked for in {folder.name}/ by the photos' names"
@@ -175,9 +178,6 @@ def _from_files(reading: Reading, photos: list[Photo], asked: bool, notes: list[
     if inverted:
         notes.append("the masks were white off the object and have been inverted")
     _say_empty(empty, notes)
-    files = [
-        m if m is not None and m.is_file() else None for m in files
-    ]  # of a held-out photo it may be missing
     masked_photos = [
         with_decoder(p, mask=m, invert=inverted, turn_mask=t)
         for p, m, t in zip(photos, files, turn, strict=True)
