@@ -88,6 +88,25 @@ def coco(root):
     }
 
 
+def labelme(root):
+    photos(root, 1)
+    shapes = [
+        {"label": "a", "group_id": k, "shape_type": "polygon", "points": p}
+        for k, p in enumerate([[[2, 2], [30, 2], [30, 30]], [[40, 2], [60, 2], [60, 30]]])
+    ]
+    size = {"imageWidth": SIDE, "imageHeight": SIDE}
+    return "annotations.json", {"shapes": shapes, "imagePath": "0.png", **size}
+
+
+def via(root):
+    photos(root, 1)
+    regions = [
+        {"shape_attributes": {"all_points_x": x, "all_points_y": [2, 2, 40]}}
+        for x in ([2, 30, 30], [40, 60, 60])
+    ]
+    return "annotations.json", {"0.png9": {"filename": "0.png", "regions": regions}}
+
+
 def nerfstudio(root):
     photos(root / "images")
     poses = [
@@ -130,11 +149,11 @@ def spoilt(value, rng):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("layout", [mvmc, ners, samurai, coco, nerfstudio])
+@pytest.mark.parametrize("layout", [mvmc, ners, samurai, coco, labelme, via, nerfstudio])
 def test_senseless_values(tmp_path, layout):
     name, good = layout(tmp_path)
     path = tmp_path / name
-    source = tmp_path / "0.png" if layout is coco else tmp_path
+    source = tmp_path / "0.png" if layout in (coco, labelme, via) else tmp_path
     path.write_text(json.dumps(good))
     capture = open_capture(source, min_photos=1)
     rng, outcomes = random.Random(5), {"read": 0, "refused": 0}
