@@ -19,7 +19,7 @@ from relit.capture.mask_edges import edge_strength
 from relit.capture.names import NameIndex
 from relit.capture.open import open_capture
 from relit.errors import UserError
-from relit.images import read_image, turn_upright, write_data
+from relit.images import read_image, turn_upright, write_data, write_linear
 from support import camera_ring
 
 APPLE_DOUBLE = bytes.fromhex("00051607000200004d6163204f532058") + bytes(100)
@@ -292,6 +292,18 @@ def test_each_photo_counts_once_and_the_rest_is_named(
     assert (mask is not None) == masked
     if masked:
         assert abs(mask.mean() - (disc() > 0).mean()) < 0.02
+
+
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".webp"])
+def test_pictures_of_one_name_that_differ_are_both_kept(tmp_path, suffix):
+    """Two objects photographed with two cameras that count alike."""
+    for k, f in enumerate(ball(tmp_path)):
+        other = np.random.default_rng(50 + k).uniform(0.1, 0.9, (H, W, 3)).astype(np.float32)
+        if suffix == ".exr":
+            write_linear(f.with_suffix(suffix), other)
+        else:
+            Image.fromarray((255 * other).astype(np.uint8)).save(f.with_suffix(suffix))
+    assert len(open_capture(tmp_path, masks="none").photos) == 2 * COUNT
 
 
 def test_photos_of_an_object_that_is_a_mask_are_photos(tmp_path):

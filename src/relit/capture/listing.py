@@ -13,6 +13,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from relit.capture.names import folded, is_hidden, stem_of
 from relit.errors import UserError
 from relit.images import EXTENSIONS, RAW, read_header, read_small
@@ -49,6 +52,9 @@ TRACES = {  # what cameras leave behind: pattern -> what it is
     "sfm_data*.json": "cameras of OpenMVG",
 }
 LOOKED_INTO = 3  # levels of sub-folders that are searched for photos when none was found
+SAME_FORM = 0.02  # relative difference of width / height of two versions of one photo
+COMPARED = 3  # pairs of two formats whose pictures are compared
+ALIKE = 0.8  # correlation of their brightness
 FEWEST = 3  # different photos; where fewer are left copies are named only
 
 
@@ -151,11 +157,12 @@ def _without_twins(files: list[Path]) -> tuple[list[Path], dict[Path, Path], lis
         groups[folded(f.stem)].append(f)
     kept, masks = [], {}
     left: dict[str, list[str]] = defaultdict(list)
+    contents: dict[str, list[str]] = defaultdict(list)
     for group in groups.values():
         first, *others = sorted(group, key=_rank)
         kept.append(first)
         for other in others:
-            kind = _twin_kind(first, other)
+            kind = _twin_kind(first, other, contents)
             if kind in ("cut-out", "mask"):
                 masks[first] = other
             if kind:
@@ -187,8 +194,9 @@ def _rank(file: Path) -> tuple[int, str]:
     return place + late, file.name
 
 
-def _twin_kind(first: Path, other: Path) -> str:
-    """'RAW', 'HEIC', 'cut-out' or 'twin'; '' where the two are different pictures."""
+def _twin_kind(first: Path, other: Path, contents: dict[str, list[str]]) -> str:
+    """'RAW', 'HEIC', 'cut-out', 'mask' or 'twin'; '' where the two are different pictures.
+    contents: what was found of earlier pairs by their extensions; a few are decoded."""
     if other.suffix.lower() == first.suffix.lower():
         return ""  # A.jpg and a.jpg
     if other.suffix.lower() in RAW:
@@ -197,21 +205,35 @@ def _twin_kind(first: Path, other: Path) -> str:
         return "HEIC"
     try:
         a, b = read_header(first), read_header(other)
+        turned = abs(a.width * b.width / (a.height * b.height) - 1) < SAME_FORM
+        turned = turned and a.width != a.height
+        if abs(a.width * b.height / (a.height * b.width) - 1) > SAME_FORM and not turned:
+            return ""
+        known = contents[first.suffix.lower() + other.suffix.lower()]
+        if len(known) < COMPARED:
+            known.append(_content(first, other, turned))
     except UserError:
         return ""  # the damaged one is refused with its reason
-    turned = abs(a.width * b.width / (a.height * b.height) - 1) < 0.02 and a.width != a.height
-    if abs(a.width * b.height / (a.height * b.width) - 1) > 0.02 and not turned:
-        return ""
-    if b.alpha and not a.alpha:
-        return "cut-out"
-    return "mask" if _is_black_and_white(other) else "twin"
+    kind = max(sorted(set(known)), key=known.count)
+    return "cut-out" if kind == "twin" and b.alpha and not a.alpha else kind
 
 
-def _is_black_and_white(file: Path) -> bool:
-    """Does a picture hold black and white only, both of them, as a mask does?"""
-    codes = read_small(file, 64).rgb
-    white, black = (codes > 0.9).all(axis=-1).mean(), (codes < 0.01).all(axis=-1).mean()
-    return white > 0.005 and black > 0.005 and white + black > 0.85
+def _content(first: Path, other: Path, turned: bool) -> str:
+    """Of two pictures of one name and shape: 'mask' where the other is black and white, 'twin'
+    where it is like the first (inside its alpha), else ''."""
+    a, b = read_small(first, 64), read_small(other, 64)
+    white, black = (b.rgb > 0.9).all(axis=-1).mean(), (b.rgb < 0.01).all(axis=-1).mean()
+    if white > 0.005 and black > 0.005 and white + black > 0.85 and b.alpha is None:
+        return "mask"
+    if turned:
+        return "twin"
+    h, w = a.rgb.shape[:2]
+    here = np.cbrt(np.maximum(a.rgb.mean(axis=-1), 0))
+    there = np.cbrt(np.maximum(cv2.resize(b.rgb, (w, h)).mean(axis=-1), 0))
+    shown = np.ones((h, w), bool) if b.alpha is None else cv2.resize(b.alpha, (w, h)) > 0.5
+    flat = min(here[shown].std(), there[shown].std()) < 1e-3 if shown.any() else True
+    alike = flat or np.corrcoef(here[shown], there[shown])[0, 1] > ALIKE
+    return "twin" if alike else ""
 
 
 def _without_copies(files: list[Path]) -> tuple[list[Path], list[str]]:

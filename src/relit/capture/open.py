@@ -281,7 +281,11 @@ def _of_project(path: Path, reading: Reading) -> Reading:
         found = module.recognise(path.parent)
         if found is None:
             continue
-        above = module.read(path.parent, found)
+        try:
+            above = module.read(path.parent, found)
+        except UserError as error:
+            note = f"the cameras of the folder above cannot be used ({error.what}): {found}"
+            return replace(reading, notes=(*reading.notes, note))
         if above.frames and all(f.path.is_relative_to(path) for f in above.frames):
             note = f"the {above.format} cameras of the folder above are used: {found}"
             return replace(above, notes=(*above.notes, note))

@@ -173,6 +173,13 @@ def test_the_images_folder_of_a_project(project, cameras):
     assert any("the folder above" in n for n in capture.notes)
 
 
+def test_a_project_that_cannot_be_read_is_said(project):
+    (project / "sparse" / "0" / "images.txt").write_text("nonsense\n")
+    capture = open_capture(project / "images", masks="none")
+    assert not capture.has_cameras
+    assert any("folder above cannot be used" in n for n in capture.notes)
+
+
 @pytest.mark.parametrize(
     "leave", ["sparse/0/images.bin", "database.db", "bundle.out", "my_transforms_v2.json"]
 )
