@@ -19,7 +19,9 @@ from relit.capture.mask_edges import edge_strength
 from relit.capture.names import NameIndex
 from relit.capture.open import open_capture
 from relit.errors import UserError
+from relit.geometry.se3 import look_at
 from relit.images import read_image, turn_upright, write_data, write_linear
+from relit.scene import Camera
 from support import camera_ring
 
 APPLE_DOUBLE = bytes.fromhex("00051607000200004d6163204f532058") + bytes(100)
@@ -158,6 +160,30 @@ def test_cameras_of_the_upright_picture_keep_it(tmp_path, cameras, orientation):
     colmap(tmp_path, cameras, names)
     capture = open_capture(tmp_path, masks="none")
     assert sum(camera_ring.check_projection(p) for p in capture.photos) > COUNT
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("size", ["stored", "upright"])
+def test_cameras_of_duplicates_are_turned_with_the_photo(tmp_path, orientation, size):
+    """A point of the world falls on the same pixel of the photo before and after it is turned."""
+    codes, labels = scene()
+    stored = turn_upright(codes, {3: 3, 6: 8, 8: 6}[orientation])
+    turned(tmp_path / "a.jpg", orientation, stored)
+    Image.fromarray(labels).save(tmp_path / "a_labels.png")
+    h, w = stored.shape[:2]
+    pose = look_at([3.0, 1.0, 2.0], [0.0, 0.0, 0.0])
+    camera = Camera(w, h, 90.0, 90.0, w / 2 + 3, h / 2 - 5, pose)
+    if size == "upright":  # some tools write cameras of the upright picture
+        if orientation == 3:
+            pytest.skip("the sizes are the same")
+        camera = Camera(W, H, 90.0, 90.0, W / 2 + 3, H / 2 - 5, pose)
+    nerf(tmp_path, [camera], ["a.jpg"])
+    found = open_capture(tmp_path).photos[0].camera
+    x, y = camera.project(np.array([0.3, -0.2, 0.1]))[:2]
+    if size == "stored":
+        x, y = {3: (w - x, h - y), 6: (h - y, x), 8: (y, w - x)}[orientation]
+    assert (found.width, found.height) == (W, H)
+    np.testing.assert_allclose(found.project(np.array([0.3, -0.2, 0.1]))[:2], (x, y), atol=1e-6)
 
 
 @pytest.mark.parametrize("orientation", [2, 3, 4])
@@ -333,6 +359,13 @@ def test_a_refusal_names_what_lies_there(tmp_path, build, words):
     with pytest.raises(UserError) as refusal:
         open_capture(tmp_path)
     assert all(w in str(refusal.value) for w in words), str(refusal.value)
+
+
+@pytest.mark.parametrize("name, said", [("clip.MP4", "a video"), ("photos.zip", "an archive")])
+def test_a_file_in_the_place_of_a_folder(tmp_path, name, said):
+    (tmp_path / name).write_bytes(b"\0" * 20)
+    with pytest.raises(UserError, match=said):
+        open_capture(tmp_path / name)
 
 
 def test_rings_in_sub_folders_of_images_are_one_capture(tmp_path):

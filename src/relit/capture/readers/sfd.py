@@ -257,9 +257,8 @@ def labelled_photo(
     w, h = header.width, header.height
     pose, known, middle = np.eye(4), None, (w / 2, h / 2)
     if source.cameras is not None and source.cameras.is_file():
-        pose, known, middle = (
-            _bop_camera if source.cameras.name == "scene_camera.json" else _camera
-        )(source.cameras, path, w, h)
+        bop = source.cameras.name == "scene_camera.json"
+        pose, known, middle = (_bop_camera if bop else _camera)(source.cameras, path, header)
     if focal is None and known is None:
         focal = header.focal
         if focal is None:
@@ -298,11 +297,27 @@ def labelled_photo(
     )
 
 
+def _upright_camera(
+    pose: np.ndarray, middle: tuple[float, float], header: Header
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """World_from_camera and principal point of the upright picture from those of the pixels as
+    stored. Mirrored pictures are left as they are."""
+    (w, h), (x, y) = header.as_stored, middle
+    axes = np.eye(4)
+    if header.orientation == 3:
+        axes[:2, :2], middle = [[-1, 0], [0, -1]], (w - x, h - y)
+    elif header.orientation == 6:
+        axes[:2, :2], middle = [[0, 1], [-1, 0]], (h - y, x)
+    elif header.orientation == 8:
+        axes[:2, :2], middle = [[0, -1], [1, 0]], (y, w - x)
+    return pose @ axes, middle
+
+
 def _camera(
-    file: Path, photo: Path, width: int, height: int
+    file: Path, photo: Path, header: Header
 ) -> tuple[np.ndarray, float | None, tuple[float, float]]:
-    """(world_from_camera, focal in pixels or None, principal point) of the photo's frame, or of the
-    first where none is named like it. SfD writes the focal length as text."""
+    """(world_from_camera, focal in pixels or None, principal point) of the photo's frame, upright;
+    of several frames none is taken for another one's. SfD writes the focal length as text."""
     data = parse_json_file(file)
     frames = (
         [f for f in data.get("frames") or [] if isinstance(f, dict)]
@@ -312,7 +327,7 @@ def _camera(
     stem = stem_key(photo.name).removesuffix("_rgb")
     frame = next(
         (f for f in frames if stem_key(str(f.get("file_path", ""))).removesuffix("_rgb") == stem),
-        frames[0] if frames else {},
+        frames[0] if len(frames) == 1 else {},
     )
     pose = (
         world_from_cv_camera(pose_from(frame["transform_matrix"], "the camera", file))
@@ -335,25 +350,31 @@ def _camera(
             )
         return out
 
+    given = number("w"), number("h")
+    width, height = header.as_stored
+    lying = header.turned and None not in given and given[0] / given[1] * header.height  # pyright: ignore[reportOperatorIssue, reportOptionalOperand]
+    upright = (
+        bool(lying) and abs(lying / header.width - 1) < 0.02
+    )  # the size is that of the upright
+    if upright:
+        width, height = header.width, header.height
     sx, sy = (
-        size / given if (given := number(key)) else 1.0
-        for key, size in (("w", width), ("h", height))
+        size / told if told else 1.0 for told, size in zip(given, (width, height), strict=True)
     )
     cx, cy = number("cx"), number("cy")
     middle = (width / 2 if cx is None else cx * sx, height / 2 if cy is None else cy * sy)
+    if not upright:
+        pose, middle = _upright_camera(pose, middle, header)
     for key in ("focal", "fl_x", "camera_angle_x"):
         value = number(key)
         if value is not None:
-            return (
-                pose,
-                width / (2 * np.tan(value / 2)) if key == "camera_angle_x" else value * sx,
-                middle,
-            )
+            wide = width / (2 * np.tan(value / 2)) if key == "camera_angle_x" else value * sx
+            return pose, wide, middle
     return pose, None, middle
 
 
 def _bop_camera(
-    file: Path, photo: Path, width: int, height: int
+    file: Path, photo: Path, header: Header
 ) -> tuple[np.ndarray, float | None, tuple[float, float]]:
     """As `_camera`, from BOP's cam_K; the world is the camera's frame (millimetres do not
     matter)."""
@@ -368,4 +389,6 @@ def _bop_camera(
             f"see: {file}",
         ) from None
     # BOP counts pixel centres as whole numbers
-    return np.eye(4), float((k[0, 0] + k[1, 1]) / 2), (float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
+    middle = (float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
+    pose, middle = _upright_camera(np.eye(4), middle, header)
+    return pose, float((k[0, 0] + k[1, 1]) / 2), middle
