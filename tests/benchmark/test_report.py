@@ -92,11 +92,25 @@ def test_records_take_baselines_and_ceilings_of_a_run():
         "machine": "2 cores",
         "runs": {"plain": {"spot": {"metrics": metrics, "ceiling": ceiling}}},
         "failed": {"plain": {}},
+        "split": "report",
+        "commit": ["0000000", False],
     }
     made = record_of(result, {})
     assert made.baselines == {"plain": {"spot": {"albedo_psnr": 12.0}}}
     assert made.ceilings == {"spot": ceiling} and made.runs["plain"]["spot"]["relit_psnr"] == 20
     assert baseline_means(result["runs"]["plain"]) == {"albedo_psnr": 12.0}
+
+
+def test_splits_have_tables_of_their_own_with_the_relit_ceiling(tmp_path):
+    lights = {"capture": {"psnr": 50.0}, "a": {"psnr": 40.0}, "b": {"psnr": 38.0}}
+    reported = record(0, 24.5, split="report", ceilings={"spot": lights})
+    write_record(reported, tmp_path / "r.json")
+    write_record(record(0, 31.0), tmp_path / "t.json")
+    assert read_record(tmp_path / "r.json").split == "report"
+    text = report(tmp_path)
+    first, second = text.split("## multiview, split `report`")[1].split("split `tune`")
+    assert "| object | relit | ceiling |" in first and "| spot | 24.5 | 39 |" in first
+    assert "| object | relit | base |" in second and "| spot | 31 | 25 |" in second
 
 
 def test_a_figure_under_an_earlier_definition_is_marked(tmp_path):
@@ -112,7 +126,7 @@ def test_a_figure_under_an_earlier_definition_is_marked(tmp_path):
 def test_old_records_without_baselines_are_read(tmp_path):
     write_record(record(0, 31.0), tmp_path / "r.json")
     content = json.loads((tmp_path / "r.json").read_text())
-    del content["baselines"], content["ceilings"]
+    del content["baselines"], content["ceilings"], content["split"]
     (tmp_path / "r.json").write_text(json.dumps(content))
     assert read_record(tmp_path / "r.json") == record(0, 31.0)
 

@@ -4,6 +4,7 @@ for by a copy of the true asset."""
 import json
 import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import trimesh
 
 from relit.benchmark import SUITES, Item, Suite, SuiteOptions, run_suite, runner
 from relit.benchmark.cost import timed
+from relit.benchmark.photographed import OPTIONS
+from relit.benchmark.progress import Share, parse_part
 from relit.benchmark.records import read_record
 from relit.benchmark.results import means, verdict
 from relit.benchmark.suites import function_at
@@ -74,16 +77,17 @@ def test_a_suite_names_what_there_is(name):
     from relit.settings import with_pairs
 
     suite = SUITES[name]
-    assert suite.kind in RECIPES and suite.items
+    assert suite.kind in RECIPES and suite.items_of(suite.default_split())
     synthesize, evaluate = function_at(suite.synthesize), function_at(suite.evaluate)
     assert (
         callable(synthesize)
         and callable(evaluate)
         and callable(function_at(suite.synthesize.rpartition(".")[0] + ".settings_of"))
     )
-    keywords = synthesize.__kwdefaults__
-    for options in (suite.options, *(item.options for item in suite.items)):
-        assert set(options) <= set(keywords)
+    known = OPTIONS.get(suite.synthesize.rpartition(".")[2], synthesize.__kwdefaults__)
+    assert callable(suite.settings_function())
+    for options in (suite.options, *(i.options for i in (*suite.items, *suite.report_items))):
+        assert set(options) <= set(known)
     for words in suite.ablations.values():
         with_pairs(
             recipe_of(suite.kind).options("standard"),
@@ -202,6 +206,9 @@ def test_a_suite_from_end_to_end(tiny, monkeypatch, capsys):
 
     captures = list((folder / "cache" / "captures").iterdir())
     stamp = (captures[0] / "truth" / "truth.json").stat().st_mtime_ns
+    again = run_suite("tiny", SuiteOptions(out=folder / "out", **options))  # all is measured
+    assert again["runs"] == result["runs"] and len(commands) == 3
+    (folder / "out" / "results.json").unlink()
     with pytest.raises(
         UserError, match="exists already"
     ):  # a run that is there would be resumed, and its time would mean nothing
@@ -262,3 +269,114 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tiny, monkeypatch, capsys
         run_suite("tiny", SuiteOptions(out=folder / "again", **options))
     assert error.value.code == EXIT_FAILED and "no pair is linked" in error.value.why
     assert json.loads((folder / "again" / "results.json").read_text())["failed"]["plain"]["ball"]
+
+
+class FakeMeasure:
+    """Stands for rendering, reconstruction and evaluation: figures by the object's name."""
+
+    def __init__(self, monkeypatch, stop_at=None):
+        self.done, self.stop_at = [], stop_at
+        monkeypatch.setattr(runner, "synthesize_item", lambda suite, item, *_: item.name)
+        monkeypatch.setattr(runner, "_measured", self.measured)
+
+    def measured(self, label, capture, run, how, say):
+        run.mkdir(parents=True)  # as `relit reconstruct` does before it is killed
+        if capture == self.stop_at:
+            raise KeyboardInterrupt
+        self.done.append(capture)
+        entry = {"value": float(len(capture)), "unit": "dB", "definition": "length of the name"}
+        return {"metrics": {"relit_psnr": entry}, "run": run.name, "capture": capture}
+
+
+@pytest.fixture
+def three(monkeypatch):
+    items = tuple(Item(n, f"assets/{n}.glb", "envmaps/a.exr") for n in ("a", "bb", "ccc"))
+    report = (Item("dddd", "assets/d.glb", "envmaps/a.exr"),)
+    monkeypatch.setitem(SUITES, "three", Suite("multiview", items, report_items=report))
+
+
+def test_a_stopped_run_goes_on_after_the_last_object(three, tmp_path, monkeypatch):
+    options = SuiteOptions(out=tmp_path / "out", json_file=tmp_path / "r.json", device="cpu")
+    FakeMeasure(monkeypatch, stop_at="bb")
+    with pytest.raises(KeyboardInterrupt):
+        run_suite("three", options)
+    before = read_record(tmp_path / "r.json")
+    assert list(before.runs["plain"]) == ["a"] and before.options["unfinished"] == ["bb", "ccc"]
+    fake = FakeMeasure(monkeypatch)
+    result = run_suite("three", options)
+    assert fake.done == ["bb", "ccc"] and result["unfinished"] == []
+    assert result["means"]["plain"] == {"relit_psnr": 2.0}
+    record = read_record(tmp_path / "r.json")
+    assert list(record.runs["plain"]) == ["a", "bb", "ccc"] and "unfinished" not in record.options
+    with pytest.raises(UserError, match="exists already"):
+        run_suite("three", options)
+    with pytest.raises(UserError, match="other options"):
+        run_suite("three", SuiteOptions(out=tmp_path / "out", quality="draft", device="cpu"))
+
+
+def test_parts_share_the_objects_and_make_one_result(three, tmp_path, monkeypatch):
+    fake = FakeMeasure(monkeypatch)
+    options = dict(out=tmp_path / "out", device="cpu")
+    first = run_suite("three", SuiteOptions(share=Share(1, 2), **options))
+    assert fake.done == ["a", "ccc"] and first["unfinished"] == ["bb"]
+    assert first["means"] == {"plain": {}}  # a mean over some objects is none of the suite
+    whole = run_suite("three", SuiteOptions(share=Share(2, 2), **options))
+    assert list(whole["runs"]["plain"]) == ["a", "bb", "ccc"] and not whole["unfinished"]
+    assert parse_part("2/3") == (2, 3)
+    for wrong in ("2", "a/b", "1/2/3"):
+        with pytest.raises(UserError, match="no part"):
+            parse_part(wrong)
+    with pytest.raises(UserError, match="no part 3 of 2"):
+        Share(3, 2)
+
+
+def test_minutes_end_a_call_after_an_object(three, tmp_path, monkeypatch):
+    fake = FakeMeasure(monkeypatch)
+    clock = iter([0.0, 0.0, 50.0, 70.0])  # start, then before each object
+    monkeypatch.setattr(runner.time, "monotonic", lambda: next(clock))
+    options = SuiteOptions(out=tmp_path / "out", device="cpu", share=Share(minutes=1))
+    assert run_suite("three", options)["unfinished"] == ["ccc"] and fake.done == ["a", "bb"]
+
+
+def test_figures_of_two_versions_make_no_record(three, tmp_path, monkeypatch):
+    FakeMeasure(monkeypatch)
+    options = SuiteOptions(out=tmp_path / "out", device="cpu", share=Share(1, 3))
+    run_suite("three", options)
+    monkeypatch.setattr(runner, "state_of_code", lambda: ("0000000", False))
+    with pytest.raises(UserError, match="has changed"):
+        file = tmp_path / "out" / "results.json"
+        file.write_text(
+            file.read_text().replace(json.loads(file.read_text())["commit"][0], "fffffff")
+        )
+        run_suite("three", options)
+
+
+def test_seeds_go_on_with_the_unfinished_one(three, tmp_path, monkeypatch):
+    fake = FakeMeasure(monkeypatch)
+    first = SuiteOptions(
+        out=tmp_path / "out", json_file=tmp_path / "r.json", device="cpu", share=Share(1, 2)
+    )
+    runner.run_seeds("three", first, 2)
+    assert fake.done == ["a", "ccc"] * 2
+    runner.run_seeds("three", replace(first, share=Share()), 2)
+    assert fake.done == ["a", "ccc"] * 2 + ["bb"] * 2
+    runner.run_seeds("three", first, 2)
+    assert len(fake.done) == 6 and read_record(tmp_path / "r-1.json").seed == 1
+
+
+def test_the_report_split_has_objects_of_its_own(three, tmp_path, monkeypatch):
+    fake = FakeMeasure(monkeypatch)
+    options = SuiteOptions(
+        out=tmp_path / "o", split="report", device="cpu", json_file=tmp_path / "r.json"
+    )
+    assert run_suite("three", options)["split"] == "report" and fake.done == ["dddd"]
+    assert read_record(tmp_path / "r.json").split == "report"
+    assert "-report-" in str(runner.record_file("three", replace(options, json_file=None), 0))
+    with pytest.raises(UserError, match="split"):
+        run_suite("three", replace(options, split="test"))
+    other = replace(options, out=tmp_path / "other", json_file=None)
+    reported = replace(SUITES["three"], items=())
+    monkeypatch.setitem(SUITES, "three", reported)
+    assert run_suite("three", replace(other, split=""))["split"] == "report"
+    with pytest.raises(UserError, match="no objects"):
+        run_suite("three", replace(other, split="tune"))

@@ -142,3 +142,30 @@ def test_angles_of_stacks_are_those_of_pairs():
     np.testing.assert_allclose(angles_between(a, b), expected, atol=1e-6)
     half = exp_so3(np.array([0, np.pi, 0]))
     assert angles_between(np.eye(3), half) == pytest.approx(180)
+
+
+def test_a_few_wrong_cameras_do_not_move_the_others():
+    """Two of ten cameras are far off: the eight others come to where they are."""
+    from relit.evaluate.alignment import align_named_cameras, pose_errors
+    from relit.geometry.se3 import exp_so3, look_at
+    from relit.scene import Camera
+
+    rng = np.random.default_rng(5)
+    eyes = rng.normal(size=(10, 3)) + np.array([0.0, 0.0, 4.0])
+    truth = {
+        f"{i}": Camera(64, 64, 60.0, 60.0, 32.0, 32.0, look_at(eye)) for i, eye in enumerate(eyes)
+    }
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = 2.5 * exp_so3(np.array([0.3, -1.0, 0.5])), (1.0, -2.0, 0.3)
+    found = {}
+    for name, camera in truth.items():
+        pose = camera.world_from_camera.copy()
+        if name in "37":
+            pose[:3, 3] += (3.0, -2.0, 1.0)
+            pose[:3, :3] = exp_so3(np.array([0.0, 0.7, 0.0])) @ pose[:3, :3]
+        moved = frame @ pose
+        moved[:3, :3] /= 2.5
+        found[name] = camera.with_pose(moved)
+    rotations, distances = pose_errors(found, truth, align_named_cameras(found, truth))
+    right = [i for i, name in enumerate(sorted(truth)) if name not in "37"]
+    assert rotations[right].max() < 1e-6 and distances[right].max() < 1e-6

@@ -1,7 +1,10 @@
 """`relit benchmark SUITE`: synthesize (cached) + reconstruct + evaluate over a suite, one table.
 
-suites.py     what is measured: objects, lights, bars, ablations of each suite
+suites/       what is measured: objects, lights, bars, ablations of each suite
+splits.py     objects that settings are chosen on, and that results are reported on
+photographed.py  synthesizers of captures through a camera model, as suites call them
 runner.py     the run over a suite
+progress.py   parts of a run, and how a stopped one goes on
 cost.py       time and memory of a command
 results.py    means, verdicts, tables
 records.py    one JSON file a run

@@ -32,7 +32,8 @@ class Record:
     failed: {variant: {object: reason}}. definitions: {figure: (unit, sentence)}. baselines: as
     runs, the best constant's or chance's score of those figures that have one. ceilings: {object:
     {light: {figure: value}}}, the true asset in our renderer. commit: of the code, or its version outside a repository. source: 'measured', or where the figures were
-    transcribed from. options: of the run, as on the command line.
+    transcribed from. options: of the run, as on the command line; "unfinished" names objects that are not measured
+    yet. split: of the objects (`benchmark.splits`); records of before the split are of tune.
     """
 
     suite: str
@@ -50,6 +51,7 @@ class Record:
     date: str = ""
     command: str = ""
     source: str = "measured"
+    split: str = "tune"
     note: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
 
@@ -94,7 +96,7 @@ def commit_time(commit: str) -> int:
 
 def record_of(result: Mapping[str, Any], options: Mapping[str, Any]) -> Record:
     """A Record of what `run_suite` returns."""
-    commit, dirty = state_of_code()
+    commit, dirty = result["commit"]
     runs: dict[str, dict[str, dict[str, float]]] = {}
     baselines: dict[str, dict[str, dict[str, float]]] = {}
     ceilings: dict[str, dict[str, dict[str, float]]] = {}
@@ -125,6 +127,7 @@ def record_of(result: Mapping[str, Any], options: Mapping[str, Any]) -> Record:
         dirty=dirty,
         date=time.strftime("%Y-%m-%d"),
         command=" ".join(["relit", *sys.argv[1:]]),
+        split=result["split"],
         options=dict(options),
     )
 

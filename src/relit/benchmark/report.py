@@ -20,6 +20,13 @@ from relit.evaluate.duplicates import DUPLICATES_DEFINITIONS
 OLD = "†"  # marks figures that are older than the last change of the code that decides them
 EARLIER = "‡"  # marks figures measured under an earlier definition of the same name
 UNKNOWN = "?"  # marks figures whose commit git does not know
+_PHOTOGRAPHED = {  # of captures whose cameras are found, or that pass through a camera model
+    "cameras": "cameras %",
+    "mask_iou": "IoU",
+    "relit_psnr": "relit",
+    "albedo_psnr": "base",
+    "chamfer_percent": "Chamfer %",
+}
 KEY = {  # figures of the tables of objects and ablations: name -> head of the column
     "multiview": {
         "relit_psnr": "relit",
@@ -27,6 +34,9 @@ KEY = {  # figures of the tables of objects and ablations: name -> head of the c
         "normal_mae": "normals",
         "chamfer_percent": "Chamfer %",
     },
+    "phone": _PHOTOGRAPHED,
+    "everyday": _PHOTOGRAPHED,
+    "turntable": _PHOTOGRAPHED,
     "flash": {
         "novel_psnr": "novel",
         "diffuse_psnr": "diffuse",
@@ -37,6 +47,7 @@ KEY = {  # figures of the tables of objects and ablations: name -> head of the c
     "collection": {
         "rotation_mean": "rotation",
         "novel_psnr": "novel",
+        "relit_psnr": "relit",
         "albedo_psnr": "base",
         "chamfer_percent": "Chamfer %",
     },
@@ -83,8 +94,10 @@ run; nothing here is typed by hand. [figures.md](../docs/figures.md) says how to
   orientations, of duplicates over registered instances only, Chamfer after a fit of the surfaces.
 * {old} after a commit: the code that decides figures has changed since. {unknown}: git does not know
   the commit. (t): transcribed from the hand-written results of aa6a283, one run each.
-* The suites render their truth with the package's own BRDF, on objects that settings were chosen
-  on. On other objects and renderers figures are lower.
+* Split `report`: objects and lights that no setting was chosen on, truth by Mitsuba's `principled`
+  and by Cycles. Split `tune`: objects that settings were chosen on, truth with the package's own
+  BRDF; on other objects and renderers figures are lower.
+* Ceiling: relit PSNR over the whole frame of the TRUE asset in Relit's renderer, mean over lights.
 """
 
 
@@ -98,15 +111,24 @@ def report(folder: Path) -> str:
     lines = [HEADER.format(old=OLD, unknown=UNKNOWN, earlier=EARLIER)]
     for suite in SUITES:
         of_suite = [r for r in records if r.suite == suite]
-        for quality in ("standard", "draft", "high"):
-            chosen = [r for r in of_suite if r.quality == quality]
-            plain = newest(chosen)
-            if plain:
-                lines += ["", f"## {suite}, `{quality}`", "", *suite_table(suite, quality, plain)]
-                lines += ["", *object_table(suite, plain), *ceiling_lines(plain)]
-            ablations = ablation_table(suite, chosen)
-            lines += [*(["", f"### Ablations, `{quality}`", ""] if ablations else []), *ablations]
+        for split in ("report", "tune"):
+            of_split = [r for r in of_suite if r.split == split]
+            for quality in ("standard", "draft", "high"):
+                chosen = [r for r in of_split if r.quality == quality]
+                lines += _section(suite, split, quality, chosen)
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _section(suite: str, split: str, quality: str, chosen: Sequence[Record]) -> list[str]:
+    """The tables of a suite's split at a quality."""
+    lines, plain = [], newest(chosen)
+    if plain:
+        head = f"## {suite}, split `{split}`, `{quality}`"
+        lines += ["", head, "", *suite_table(suite, quality, plain)]
+        lines += ["", *object_table(suite, plain), *ceiling_lines(plain)]
+    ablations = ablation_table(suite, chosen)
+    lines += [*(["", f"### Ablations, `{quality}`", ""] if ablations else []), *ablations]
+    return lines
 
 
 @dataclass(frozen=True)
@@ -210,6 +232,13 @@ def ceiling_lines(rows: Sequence[Row]) -> list[str]:
     return ["", *textwrap.wrap(text, 100, break_long_words=False, break_on_hyphens=False)]
 
 
+def relit_ceiling(row: Row) -> float | None:
+    """Mean over relighting lights of the whole frame's ceiling in dB; None where none is known."""
+    lights = row.records[-1].ceilings.get(row.name, {})
+    values = [f["psnr"] for name, f in lights.items() if name != "capture" and "psnr" in f]
+    return float(np.mean(values)) if values else None
+
+
 def met(bar: tuple[str, float] | None, mean: float, spread: float) -> str:
     """'met', 'missed', or '' without a bar: by the worse side of mean and spread."""
     if bar is None:
@@ -220,10 +249,18 @@ def met(bar: tuple[str, float] | None, mean: float, spread: float) -> str:
 
 def object_table(suite: str, rows: Sequence[Row]) -> list[str]:
     """The key figures of each object, mean and spread over seeds, with the commit of each row."""
-    lines = [_row(["object", *KEY[suite].values(), "seeds", "commit"])]
-    lines.append("|" + "---|" * (len(KEY[suite]) + 3))
-    for row in rows:
+    ceilings = [relit_ceiling(row) for row in rows]
+    heads = list(KEY[suite].values())
+    beside = None  # the column of ceilings follows that of relit pictures
+    if "relit_psnr" in KEY[suite] and any(c is not None for c in ceilings):
+        beside = list(KEY[suite]).index("relit_psnr") + 1
+        heads.insert(beside, "ceiling")
+    lines = [_row(["object", *heads, "seeds", "commit"])]
+    lines.append("|" + "---|" * (len(heads) + 3))
+    for row, ceiling in zip(rows, ceilings, strict=True):
         values = [mean_text(row.values(f)) for f in KEY[suite]]
+        if beside is not None:
+            values.insert(beside, "-" if ceiling is None else f"{ceiling:.4g}")
         lines.append(_row([row.name, *values, str(len(row.records)), commit_text(row.records[0])]))
     return lines
 

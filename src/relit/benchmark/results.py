@@ -45,9 +45,12 @@ def markdown(result: dict[str, Any], suite: Suite) -> str:
     """A fragment for benchmarks/RESULTS.md: per variant one table with the objects, the mean, and
     the bar; then what failed, and why."""
     lines = [
-        f"Suite `{result['suite']}`, quality `{result['quality']}`, device `{result['device']}`, {result['machine']}.",
+        f"Suite `{result['suite']}`, split `{result['split']}`, quality `{result['quality']}`, "
+        f"device `{result['device']}`, {result['machine']}.",
         "",
     ]
+    if result["unfinished"]:
+        lines += [f"Not measured yet: {', '.join(result['unfinished'])}.", ""]
     for variant, runs in result["runs"].items():
         lines += [f"### {variant}", ""]
         if runs:
@@ -78,8 +81,8 @@ def means_table(result: dict[str, Any], suite: Suite):
     object failed is a column of dashes."""
     from rich.table import Table
 
-    objects = {*result["runs"]["plain"], *result["failed"]["plain"]}
-    out = Table(title=f"{result['suite']}, {result['quality']}, mean of {len(objects)} objects")
+    title = f"{result['suite']}, {result['split']}, {result['quality']}"
+    out = Table(title=f"{title}, mean of {len(result['objects'])} objects")
     out.add_column("figure")
     for variant in result["means"]:
         out.add_column(variant, justify="right")

@@ -55,6 +55,7 @@ REPORT = Split(
     range(100, 2**31),
 )
 SPLITS = (TUNE, REPORT)
+SPLIT_NAMES = tuple(split.name for split in SPLITS)
 
 
 def split_of(asset: str | Path) -> Split | None:

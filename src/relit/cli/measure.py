@@ -48,6 +48,7 @@ def do_evaluate(args) -> None:
 
 
 def benchmark_flags(parser: Parser) -> None:
+    from relit.benchmark.splits import SPLIT_NAMES
     from relit.benchmark.suites import SUITES
 
     parser.add_argument("suite", nargs="?", help=f"name of a suite: {', '.join(SUITES)}")
@@ -59,13 +60,18 @@ def benchmark_flags(parser: Parser) -> None:
     add("--seeds", type=int, default=None, metavar="N", help=seeds)
     report = "print RESULTS.md from the records in DIR (default benchmarks/results)"
     add("--report", nargs="?", const=RESULTS, type=Path, default=None, metavar="DIR", help=report)
+    split = "objects: tune (settings were chosen on them, default) or report"
+    add("--split", choices=SPLIT_NAMES, default="", help=split)
+    minutes = "begin no object after so many minutes; the next call with the same --out goes on"
+    add("--minutes", type=float, default=None, metavar="N", help=minutes)
     more = parser.more.add_argument
+    more("--part", default=None, metavar="K/N", help="measure every N-th object, from the K-th on")
     more("--objects", default="", metavar="NAME,...", help="only these objects of the suite")
     more("--cache", type=Path, default=None, metavar="DIR", help="where rendered captures are kept")
     more(
         "--assets", type=Path, default=None, metavar="DIR", help="folder with assets/ and envmaps/"
     )
-    out = "where the runs go; with --report the file to write"
+    out = "where the runs go, and go on; with --report the file to write"
     more("-o", "--out", type=Path, default=None, metavar="PATH", help=out)
 
 
@@ -87,6 +93,8 @@ def do_benchmark(args) -> None:
         raise UserError("no suite was named", fix="relit benchmark SUITE", code=EXIT_USAGE)
     options = SuiteOptions(
         quality=args.quality,
+        split=args.split,
+        share=_share(args),
         ablate=[a for a in args.ablate.split(",") if a],
         objects=[o for o in args.objects.split(",") if o],
         device=args.device,
@@ -100,3 +108,13 @@ def do_benchmark(args) -> None:
         run_seeds(args.suite, options, args.seeds)
     else:
         run_suite(args.suite, options)
+
+
+def _share(args):
+    """The Share that --part and --minutes name."""
+    import math
+
+    from relit.benchmark.progress import Share, parse_part
+
+    part, parts = parse_part(args.part) if args.part else (1, 1)
+    return Share(part, parts, math.inf if args.minutes is None else args.minutes)

@@ -64,12 +64,22 @@ def sampling_flags(
     )
 
 
+def renderer_flag(parser: Parser) -> None:
+    """--renderer, of the truth."""
+    from relit.synthesize.renderers import RENDERERS
+
+    parser.common.add_argument(
+        "--renderer",
+        choices=RENDERERS,
+        default="relit",
+        help="renderer of the truth: relit (default), mitsuba (principled) or cycles (Blender)",
+    )
+
+
 # ---------------------------------------------------------------- multiview
 
 
 def multiview_flags(parser: Parser) -> None:
-    from relit.synthesize.renderers import RENDERERS
-
     add = parser.common.add_argument
     add(
         "--light",
@@ -80,12 +90,7 @@ def multiview_flags(parser: Parser) -> None:
         help="light: lat-long .hdr or .exr",
     )
     relight_flag(parser)
-    add(
-        "--renderer",
-        choices=RENDERERS,
-        default="relit",
-        help="renderer of the truth: relit (default), mitsuba (principled) or cycles (Blender)",
-    )
+    renderer_flag(parser)
     sampling_flags(parser, views=60, test_views=12, resolution=400, spp=64, test_spp=256)
     delivery_flags(parser)
 
@@ -143,6 +148,20 @@ def flash_flags(parser: Parser) -> None:
         help="offset of the flash: right, down, forward (default -.11 -.06 0)",
     )
     more("--png", action="store_true", help="write photos as 8-bit PNG instead of linear EXR")
+    more("--paint", default="own", help="colours: own (default), dark or bright")
+    more(
+        "--material",
+        default="plastic",
+        help="plastic (default), or own: the file's by Mitsuba's principled",
+    )
+    more(
+        "--ambient",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="light of the room, by --light, as a share of the flash's (default 0)",
+    )
+    more("--light", type=Path, nargs=1, default=(), metavar="FILE", help="light of the room")
 
 
 def flash(args) -> None:
@@ -159,7 +178,7 @@ def flash(args) -> None:
     use_device(args.device)
     synthesize_flash(
         args.asset,
-        (),
+        args.light,
         args.out,
         views=args.views,
         test_views=args.test_views,
@@ -170,6 +189,9 @@ def flash(args) -> None:
         seed=args.seed,
         offset=args.flash_offset or OFFSET,
         png=args.png,
+        paint=args.paint,
+        material=args.material,
+        ambient=args.ambient,
         say=Log().say,
     )
 
@@ -187,6 +209,8 @@ def collection_flags(parser: Parser) -> None:
         metavar="FILE",
         help="lights: lat-long .hdr or .exr; each photo uses one",
     )
+    relight_flag(parser)
+    renderer_flag(parser)
     sampling_flags(parser, views=60, test_views=6, resolution=400, spp=48, test_spp=192)
     more = parser.more.add_argument
     more(
@@ -195,6 +219,27 @@ def collection_flags(parser: Parser) -> None:
         default=1.0,
         metavar="PIXELS",
         help="amplitude of the error of mask outlines (default 1)",
+    )
+    more(
+        "--roll",
+        type=float,
+        default=12.0,
+        metavar="DEGREES",
+        help="largest turn of a camera about its axis (default 12)",
+    )
+    more(
+        "--wrong-hints",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="photos whose answers in quadrants.json are wrong (default 0)",
+    )
+    more(
+        "--occluders",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="photos with a hand or a stand in front of the object (default 0)",
     )
 
 
@@ -217,6 +262,11 @@ def collection(args) -> None:
         roughness=args.roughness,
         metallic=args.metallic,
         rough_masks=args.rough_masks,
+        relights=args.relight,
+        renderer=args.renderer,
+        roll=args.roll,
+        wrong_hints=args.wrong_hints,
+        occluders=args.occluders,
         say=Log().say,
     )
 
@@ -235,6 +285,7 @@ def duplicates_flags(parser: Parser) -> None:
         help="light: lat-long .hdr or .exr",
     )
     relight_flag(parser)
+    renderer_flag(parser)
     add("--count", type=int, default=10, help="objects in the photo (default 10)")
     add("--photos", type=int, default=1, help="photos of the pile (default 1)")
     add("--test-views", type=int, default=8, help="novel views of the pile (default 8)")
@@ -286,6 +337,7 @@ def duplicates(args) -> None:
         args.light[0],
         args.out,
         count=args.count,
+        renderer=args.renderer,
         photos=args.photos,
         test_views=args.test_views,
         relights=args.relight,

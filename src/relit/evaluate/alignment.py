@@ -12,6 +12,7 @@ from relit.errors import UserError
 from relit.geometry import se3
 from relit.scene import Asset, Camera, Flash
 
+TRIMMED_STEPS = 10  # of the fit to the best half; it stays after three or four
 LOST = 180.0  # degrees: the rotation error of what has no pose, an instance or a photo
 
 
@@ -61,7 +62,9 @@ def align_named_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) 
     Fitted on the camera centres together with one point ahead of each, at the mean distance of the
     cameras from their common
     centre: turntables and arcs, whose centres alone nearly lie in a line or plane, are well
-    determined that way.
+    determined that way. Fitted again to the half of the cameras that fits best (least trimmed
+    squares; Rousseeuw & Van Driessen 2006), at last to all within 3 medians: a few wrong ones do
+    not move the others.
     """
     names = sorted(set(recovered) & set(truth))
     if not names:
@@ -71,19 +74,32 @@ def align_named_cameras(recovered: dict[str, Camera], truth: dict[str, Camera]) 
         )
     a = np.array([recovered[n].world_from_camera for n in names])
     b = np.array([truth[n].world_from_camera for n in names])
-    spread_a, spread_b = (
-        np.linalg.norm(m[:, :3, 3] - m[:, :3, 3].mean(0), axis=1).mean() for m in (a, b)
-    )
-    if len(names) < 2 or spread_a < 1e-12:
+    keep = np.ones(len(names), bool)
+    if len(names) < 2 or np.ptp(a[:, :3, 3], axis=0).max() < 1e-12:
         raise UserError(
             f"{len(names)} matched cameras cannot fix a scale",
             "at least 2 apart from each other are needed",
         )
-    ahead_a = a[:, :3, 3] + a[:, :3, 2] * spread_a
-    ahead_b = b[:, :3, 3] + b[:, :3, 2] * spread_b
-    return align_points(
-        np.concatenate([a[:, :3, 3], ahead_a]), np.concatenate([b[:, :3, 3], ahead_b])
+    similarity, off = _fit_poses(a, b, keep)
+    for step in range(TRIMMED_STEPS + 1 if len(names) >= 5 else 0):
+        medians = 3 if step == TRIMMED_STEPS else 1
+        keep = off <= medians * np.median(off) + 1e-9 * np.ptp(b[:, :3, 3])
+        similarity, off = _fit_poses(a, b, keep)
+    return similarity
+
+
+def _fit_poses(a: np.ndarray, b: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """b_from_a (4, 4) of the poses `keep` (N,) of (N, 4, 4), and how far each pose is off (N,): the
+    farther of its centre and of the point ahead of it."""
+    spreads = (
+        np.linalg.norm(c - c.mean(0), axis=1).mean() for c in (a[keep, :3, 3], b[keep, :3, 3])
     )
+    found, true = (
+        np.stack([m[:, :3, 3], m[:, :3, 3] + m[:, :3, 2] * spread], 1)
+        for m, spread in zip((a, b), spreads, strict=True)
+    )
+    similarity = align_points(found[keep].reshape(-1, 3), true[keep].reshape(-1, 3))
+    return similarity, np.linalg.norm(move_points(similarity, found) - true, axis=-1).max(1)
 
 
 def angle_between(a, b) -> float:

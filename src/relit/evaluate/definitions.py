@@ -73,9 +73,11 @@ DEFINITIONS: dict[str, tuple[str, str]] = {  # name -> (unit, definition)
         f"as glb_roundtrip_psnr, over pixels with coverage >= {m.MASK} in the pictures of the fit",
     ),
     "glb_roundtrip_ssim": ("", f"as glb_roundtrip_psnr: {m.DEFINITIONS['ssim']}"),
+    "cameras": ("%", "share of the training photos that have a camera, where cameras were found"),
     "camera_rotation": (
         "degrees",
-        "median rotation error of the recovered cameras after Sim(3) alignment to the true ones",
+        "median rotation error of the recovered cameras after Sim(3) alignment to the true ones "
+        "(without those more than 3 medians off)",
     ),
     "camera_centre_percent": (
         "% of diameter",

@@ -105,6 +105,7 @@ def _camera_figures(cameras: dict[str, Camera], truth: Truth) -> dict[str, float
     """Of cameras that stand in the truth's frame."""
     rotations, distances = pose_errors(cameras, truth.train, np.eye(4))
     return {
+        "cameras": 100 * len(rotations) / len(truth.train),
         "camera_rotation": float(np.median(rotations)),
         "camera_centre_percent": float(100 * np.median(distances) / (2 * truth.radius)),
     }
@@ -120,7 +121,9 @@ def _camera_chance(
     turned = turned_cameras(centre, names, random_rotations(len(names), rng))
     frame = align_named_cameras(turned, truth.train)
     moved = {n: c.with_pose(move_pose(frame, c.world_from_camera)) for n, c in turned.items()}
-    return _camera_figures(moved, truth)
+    values = _camera_figures(moved, truth)
+    del values["cameras"]  # chance has no part in it
+    return values
 
 
 def fixed_albedo_scale(scene, truth: Truth) -> np.ndarray:

@@ -5,7 +5,7 @@ The folder has SAMURAI's layout, with the truth beside it:
 
     image/000.jpg ...       8-bit sRGB with the surroundings in view, in landscape and portrait
     mask/000.png ...        roughened: the outline wanders by a pixel or two
-    quadrants.json          SAMURAI's three answers for each photo
+    quadrants.json          SAMURAI's three answers for each photo, some of them wrong on demand
     held_out.json           {"frames": [names]}: photos that are for testing only
     truth/truth.json        what was rendered and how; written last
     truth/cameras.json      all cameras, in the world frame (y up)
@@ -15,6 +15,8 @@ The folder has SAMURAI's layout, with the truth beside it:
     truth/test/NAME.exr     linear RGBA, premultiplied on black, with
                             NAME_{albedo,normal,roughness,metallic,depth}.exr
     truth/train_albedo/NAME.exr     linear RGBA of a few training views, to fix the albedo scale
+    truth/relight/LIGHT.exr  truth/relight/LIGHT/NAME.exr   other lights, and the views of the test
+                                                            photos under them
 
 World frame: as in `synthesize.multiview`.
 """
@@ -35,10 +37,14 @@ from relit.conventions import sample_environment
 from relit.errors import UserError
 from relit.geometry.se3 import exp_so3, look_at
 from relit.scene import Camera
+from relit.synthesize.ceiling import ceilings
+from relit.synthesize.mask_errors import MaskErrors, MaskFault, draw_fault, occluded
 from relit.synthesize.multiview import (
     LOWEST,
     RADIUS,
+    check_relight_names,
     claim_folder,
+    exposed,
     identity_of,
     object_frame,
     overridden,
@@ -46,9 +52,11 @@ from relit.synthesize.multiview import (
     tell_progress,
     write_json,
     write_mesh,
+    write_radiance,
+    write_scale_view,
     write_test_view,
-    write_training_view,
 )
+from relit.synthesize.renderers import TrueObject, build_truth, depth_of, require_renderer
 
 VERSION = 1
 FIELD = (35.0, 65.0)  # degrees, along the longer side
@@ -58,6 +66,8 @@ LEVEL = (0.45, 0.85)  # linear value of the 95th percentile of the object's brig
 WHITE_BALANCE = 0.12  # standard deviation of the log gain of red and of blue
 LIGHT_ROWS = 64  # of the lights that are kept as truth
 SCALE_VIEWS = 8
+# Options that came later: a capture at these values has the settings, and the hash, of before.
+LATER = {"renderer": "relit", "roll": ROLL, "wrong_hints": 0.0, "occluders": 0.0, "relights": []}
 
 
 @dataclass(frozen=True)
@@ -86,10 +96,14 @@ def synthesize_collection(
     spp: int = 48,
     test_spp: int = 192,
     seed: int = 0,
+    renderer: str = "relit",
     roughness: float | None = None,
     metallic: float | None = None,
     rough_masks: float = 1.0,
-    max_depth: int = 6,
+    roll: float = ROLL,
+    wrong_hints: float = 0.0,
+    occluders: float = 0.0,
+    max_depth: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Path:
     """Render a collection of one object with its truth into `out`; returns `out`.
@@ -97,19 +111,18 @@ def synthesize_collection(
     light_files: one or more lat-long .hdr or .exr; every photo takes one of them, turned about the
     vertical. resolution: the longer side.
     rough_masks: pixels by which outlines of masks wander, at resolution 400; 0 for true masks.
-    relights stands for the call's shape. Deterministic by `seed`; takes up where a killed call
-    stopped. Raises UserError as `synthesize_multiview`.
+    relights: lights of the relighting truth. renderer: one of `synthesize.renderers.RENDERERS`.
+    roll: largest turn of a camera about its axis, degrees. wrong_hints: share of the photos, rounded
+    up, whose answers are those of another octant. occluders: share of the training photos with a
+    hand or a stand in front of the object; it is no part of the mask. Deterministic by `seed`; takes
+    up where a killed call stopped. Raises UserError as `synthesize_multiview`.
     """
     asset_file, out = Path(asset_file), Path(out)
     lights = [
         Path(f) for f in ([light_files] if isinstance(light_files, (str, Path)) else light_files)
     ]
-    if relights:
-        raise UserError(
-            "a collection has no relighting truth: every photo has a light of its own",
-            fix="leave out --relight",
-            code=2,
-        )
+    relights, max_depth = [Path(r) for r in relights], depth_of(renderer, max_depth)
+    check_relight_names(relights)
     least = {
         "views": (views, 4),
         "test_views": (test_views, 0),
@@ -120,6 +133,7 @@ def synthesize_collection(
     for label, (value, low) in least.items():
         if value < low:
             raise UserError(f"{label} = {value} is too few", fix=f"at least {low}", code=2)
+    _check_shares(wrong_hints=wrong_hints, occluders=occluders, roll=roll / 180)
     options = {
         "views": views,
         "test_views": test_views,
@@ -134,7 +148,16 @@ def synthesize_collection(
         "rough_masks": rough_masks,
         "max_depth": max_depth,
     }
+    more |= {
+        "renderer": renderer,
+        "roll": roll,
+        "wrong_hints": wrong_hints,
+        "occluders": occluders,
+        "relights": relights,
+    }
     settings = settings_of(asset_file, lights, **options, **more)
+    if not (out / "truth" / "truth.json").exists():
+        require_renderer(renderer)  # before anything is written
     if claim_folder(out, settings):
         return out
 
@@ -144,12 +167,11 @@ def synthesize_collection(
 
     mesh, material = read_asset_file(asset_file)
     material = overridden(material, roughness, metallic)
-    world_from_asset = object_frame(mesh)
-    shots = plan_shots(views, test_views, resolution, len(lights), seed)
-    write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
-    frames = [
-        {"image_name": f"{s.name}.jpg", "quadrant": quadrant_of(s.camera.centre)} for s in shots
-    ]
+    thing = TrueObject(mesh, material, object_frame(mesh))
+    shots = plan_shots(views, test_views, resolution, len(lights), (seed, roll))
+    write_mesh(out / "truth" / "mesh.ply", mesh, thing.world_from_asset)
+    hints, wrong = octant_hints(shots, wrong_hints, seed)
+    frames = [{"image_name": f"{name}.jpg", "quadrant": hint} for name, hint in hints.items()]
     write_json(out / "quadrants.json", {"frames": frames})
     test = [f"{s.name}.jpg" for s in shots if s.test]
     if test:
@@ -165,38 +187,44 @@ def synthesize_collection(
             np.linspace(0, len(training) - 1, min(SCALE_VIEWS, len(training))).round().astype(int)
         )
     }
-    environments = [read_image(file).rgb for file in lights]
+    stage = _Stage(
+        out,
+        thing,
+        [read_image(file).rgb for file in lights],
+        renderer,
+        max_depth,
+        rough_masks,
+        MaskErrors(occluders=occluders),
+        frozenset(scale_names),
+    )
     for i, shot in enumerate(shots):
-        samples = test_spp if shot.test else spp
-        take(
-            out,
-            shot,
-            mesh,
-            material,
-            world_from_asset,
-            environments,
-            samples,
-            max_depth,
-            seed * 1_000_003 + i,
-            rough_masks,
-            scale_names,
-        )
+        take(stage, shot, test_spp if shot.test else spp, seed * 1_000_003 + i)
         tell_progress(say, "photo", i, len(shots))
-    sphere = {"centre": [0.0, 0.0, 0.0], "radius": RADIUS}
+    held = [(s.name, s.camera) for s in shots if s.test]
+    under = _relighting_truth(stage, relights, held, test_spp, seed * 1_000_003 + 600_000)
     head = {
         "settings": settings,
-        "world_from_asset": world_from_asset.tolist(),
-        "sphere": sphere,
+        "world_from_asset": thing.world_from_asset.tolist(),
+        "sphere": {"centre": [0.0, 0.0, 0.0], "radius": RADIUS},
         "ior": material.ior,
+        "wrong_hints": wrong,
+        **({"ceiling": ceilings(thing, under, test_spp, seed, say)} if under else {}),
     }
     names = {
         "train": training,
         "test": [s.name for s in shots if s.test],
         "train_albedo": sorted(scale_names),
-        "relight": [],
+        "relight": [file.stem for file in relights] if held else [],
     }
     write_json(out / "truth" / "truth.json", {**head, **names})
     return out
+
+
+def _check_shares(**shares: float) -> None:
+    for label, value in shares.items():
+        if not 0 <= value <= 1:
+            what = "roll is outside 0 to 180 degrees" if label == "roll" else f"{label} = {value}"
+            raise UserError(what, "" if label == "roll" else "it is a share", code=2)
 
 
 def settings_of(
@@ -208,7 +236,8 @@ def settings_of(
     ]
     if not lights:
         raise UserError("no light was given", fix="give one or more .hdr or .exr files", code=2)
-    for what, file in (("asset", Path(asset_file)), *(("light", f) for f in lights)):
+    relights = [Path(f) for f in options.pop("relights", ())]
+    for what, file in (("asset", Path(asset_file)), *(("light", f) for f in [*lights, *relights])):
         if not file.is_file():
             raise UserError(f"no {what} file: {file}", fix="give an existing file")
     plain = {
@@ -216,6 +245,9 @@ def settings_of(
         for key, value in synthesize_collection.__kwdefaults__.items()
         if key not in ("relights", "say")
     }
+    plain["max_depth"] = depth_of(plain["renderer"], plain["max_depth"])
+    plain |= {"relights": [identity_of(f) for f in relights]}
+    plain = {k: v for k, v in plain.items() if k not in LATER or v != LATER[k]}
     return {
         "version": VERSION,
         "kind": "collection",
@@ -228,10 +260,28 @@ def settings_of(
 # ---------------------------------------------------------------- where the cameras stand
 
 
+def octant_hints(
+    shots: Sequence[PhotoPlan], wrong: float, seed: int
+) -> tuple[dict[str, Any], list[str]]:
+    """({name: SAMURAI's answers}, names of those that are wrong). wrong: share of the photos,
+    rounded up, whose answers are those for a random camera in another octant."""
+    hints = {s.name: quadrant_of(s.camera.centre) for s in shots}
+    rng = np.random.default_rng([seed, 73])
+    count = int(np.ceil(wrong * len(shots)))
+    chosen = sorted(shots[i].name for i in rng.permutation(len(shots))[:count])
+    for name in chosen:
+        true = hints[name]
+        while hints[name] == true:
+            hints[name] = quadrant_of(rng.normal(size=3))
+    return hints, chosen
+
+
 def plan_shots(
-    views: int, test_views: int, resolution: int, lights: int, seed: int
+    views: int, test_views: int, resolution: int, lights: int, draw: tuple[int, float]
 ) -> list[PhotoPlan]:
-    """All photos; test photos are spread evenly among the others."""
+    """All photos; test photos are spread evenly among the others. draw: seed, and the largest roll
+    in degrees."""
+    seed, roll = draw
     rng, count = np.random.default_rng(seed), views + test_views
     order = rng.permutation(count)  # neighbours on the spiral are not neighbours in name
     test = {int((k + 0.5) * count / test_views) for k in range(test_views)}
@@ -250,7 +300,7 @@ def plan_shots(
             0.5 * short * rng.uniform(*FILL)
         )  # pixels from the middle of the object to its sphere's outline
         distance = RADIUS * np.hypot(1, focal / seen)
-        pose = look_at(direction * distance, roll=np.radians(rng.uniform(-ROLL, ROLL)))
+        pose = look_at(direction * distance, roll=np.radians(rng.uniform(-roll, roll)))
         room = 0.5 * short - seen
         off = rng.uniform(-1, 1, 2) * min(AIM * short, room)
         pose[:3, :3] = pose[:3, :3] @ exp_so3(np.array([off[1], -off[0], 0]) / focal)
@@ -273,33 +323,36 @@ def plan_shots(
 # ---------------------------------------------------------------- one photo
 
 
-def take(
-    out: Path,
-    shot: PhotoPlan,
-    mesh,
-    material,
-    world_from_asset,
-    environments,
-    spp,
-    max_depth,
-    seed,
-    rough_masks,
-    scale_names,
-) -> None:
+@dataclass(frozen=True)
+class _Stage:
+    """What all photos share. environments: radiance of the lights. rough_masks: see
+    `synthesize_collection`. scale: names of photos whose albedo is kept."""
+
+    out: Path
+    thing: TrueObject
+    environments: Sequence[np.ndarray]
+    renderer: str
+    max_depth: int
+    rough_masks: float
+    errors: MaskErrors
+    scale: frozenset[str]
+
+
+def take(stage: _Stage, shot: PhotoPlan, spp: int, seed: int) -> None:
     """Render one photo, its mask and its truth, unless they are there."""
     from relit.images import write_bytes, write_data, write_linear
     from relit.images.write import encode_jpeg
-    from relit.reference.mitsuba_scene import build_scene
 
+    out, max_depth = stage.out, stage.max_depth
     photo, light_file = (
         out / "image" / f"{shot.name}.jpg",
         out / "truth" / "lights" / f"{shot.name}.exr",
     )
     if photo.exists():
         return
-    environment = environments[shot.light]
+    environment = stage.environments[shot.light]
     environment = np.roll(environment, round(shot.yaw * environment.shape[1]), axis=1)
-    scene = build_scene(mesh, material, world_from_asset, environment)
+    scene = build_truth(stage.renderer, stage.thing, environment, max_depth)
     camera = shot.camera
     small = camera.resized(max(8, round(camera.width / 4)), max(8, round(camera.height / 4)))
     glimpse = radiance(scene, small, 48, max_depth, seed + 77)
@@ -321,19 +374,51 @@ def take(
             interpolation=cv2.INTER_AREA,
         ),
     )
-    if shot.test or shot.name in scale_names:
-        lit = build_scene(mesh, material, world_from_asset, light)
+    if shot.test or shot.name in stage.scale:
+        lit = build_truth(stage.renderer if shot.test else "relit", stage.thing, light, max_depth)
         if shot.test:
             write_test_view(out / "truth" / "png", lit, shot.name, camera, spp, max_depth, seed)
         else:
-            write_training_view(out / "truth" / "png", lit, shot.name, camera, 16, 2, seed, True)
+            write_scale_view(out / "truth" / "png", lit, shot.name, camera)
+        lit.close()
         keep_truth(out)
     rgba = radiance(scene, camera, spp, max_depth, seed)
+    scene.close()
     rgba[..., :3] *= gain
     behind = sample_environment(light, camera_directions(camera))
-    write_data(out / "mask" / f"{shot.name}.png", roughened(rgba[..., 3], rough_masks, seed))
-    picture = np.clip(rgba[..., :3] + behind * (1 - rgba[..., 3:]), 0, 1)
+    picture, mask = rgba[..., :3] + behind * (1 - rgba[..., 3:]), rgba[..., 3]
+    fault = MaskFault(False, "", "", seed) if shot.test else draw_fault(stage.errors, seed)
+    if fault.occluder:
+        picture, mask = occluded(picture, mask, fault)
+    write_data(out / "mask" / f"{shot.name}.png", roughened(mask, stage.rough_masks, seed))
+    picture = np.clip(picture, 0, 1)
     write_bytes(photo, encode_jpeg(picture, 93))  # last: it says that the shot is complete
+
+
+def _relighting_truth(
+    stage: _Stage,
+    relights: Sequence[Path],
+    test: Sequence[tuple[str, Camera]],
+    spp: int,
+    seed: int,
+) -> dict[str, tuple[Path, list[tuple[Path, Camera]]]]:
+    """Render the views of the test photos under each light; returns the files by light, as
+    `ceilings` takes them."""
+    from relit.images import read_image, write_linear
+
+    under = {}
+    for j, file in enumerate(relights if test else ()):
+        folder = stage.out / "truth" / "relight" / file.stem
+        scene, light = exposed(
+            stage.renderer, stage.thing, read_image(file).rgb, test, stage.max_depth
+        )
+        write_linear(folder.with_suffix(".exr"), light)
+        pictures = [(folder / f"{name}.exr", camera) for name, camera in test]
+        for i, (target, camera) in enumerate(pictures):
+            write_radiance(target, scene, camera, spp, stage.max_depth, seed + 1000 * j + i)
+        scene.close()
+        under[file.stem] = (folder.with_suffix(".exr"), pictures)
+    return under
 
 
 def keep_truth(out: Path) -> None:

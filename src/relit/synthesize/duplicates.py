@@ -30,8 +30,9 @@ from relit.geometry.se3 import exp_so3, look_at, rotation_from
 from relit.scene import Camera, Ground, Mesh
 from relit.synthesize.multiview import (
     RADIUS,
+    check_relight_names,
     claim_folder,
-    exposure_factor,
+    exposed,
     identity_of,
     object_frame,
     overridden,
@@ -39,8 +40,10 @@ from relit.synthesize.multiview import (
     tell_progress,
     write_json,
 )
+from relit.synthesize.renderers import TrueObject, depth_of, require_renderer
 
 VERSION = 3
+MAX_DEPTH = 5  # edges of the longest path, of the package's own renderer
 FOV = 38.0  # degrees, the shorter side of the photo
 ELEVATION = 55.0  # degrees, of the photo's camera
 STEP = 35.0  # degrees around the pile from one photo to the next
@@ -65,12 +68,13 @@ def synthesize_duplicates(
     spp: int = 64,
     test_spp: int = 128,
     seed: int = 0,
+    renderer: str = "relit",
     lean: float = 12.0,
     spread: float = 1.0,
     nodes: Sequence[str] = (),
     roughness: float | None = None,
     metallic: float | None = None,
-    max_depth: int = 5,
+    max_depth: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Path:
     """Render one photo of `count` copies of an object under one light, with its truth, into `out`;
@@ -78,7 +82,7 @@ def synthesize_duplicates(
 
     photos: of the same pile, STEP degrees apart around it; their labels agree. lean: standard
     deviation in degrees of the tilt away from the resting pose. spread: factor on the radius of the
-    pile. nodes: names of the glTF nodes whose meshes are taken, all where empty. Others: as
+    pile. renderer: one of `synthesize.renderers.RENDERERS`. nodes: names of the glTF nodes whose meshes are taken, all where empty. Others: as
     `synthesize_multiview`. Deterministic by `seed`; a call with the same settings takes up where a
     stopped one was. Raises UserError when a file cannot be read or a number makes no sense.
     """
@@ -91,12 +95,15 @@ def synthesize_duplicates(
     relights = [Path(r) for r in relights]
     _check(options, relights)
     settings = settings_of(asset_file, light_file, relights=relights, **options)
+    max_depth = settings["max_depth"]
+    if not (out / "truth" / "truth.json").exists():
+        require_renderer(renderer)  # before anything is written
     if claim_folder(out, settings):
         return out
 
     from relit.asset.gltf import read_asset_file, write_glb
     from relit.images import read_image, write_linear, write_srgb
-    from relit.reference.mitsuba_scene import build_scene, render, render_channels
+    from relit.reference.mitsuba_scene import render_channels
     from relit.reference.pile import build_pile, instance_ids
 
     mesh, material = read_asset_file(asset_file, nodes)
@@ -113,20 +120,17 @@ def synthesize_duplicates(
     truth = out / "truth"
 
     def lit(file: Path):
-        environment = read_image(file).rgb
-        scene = build_scene(pile.mesh, pile.material, np.eye(4), environment)
-        environment = (environment * exposure_factor(scene, [("", camera)], max_depth)).astype(
-            np.float32
-        )
-        return build_scene(pile.mesh, pile.material, np.eye(4), environment), environment
+        """The pile under a light whose exposure fits it, and that light."""
+        whole = TrueObject(pile.mesh, pile.material, np.eye(4))
+        return exposed(renderer, whole, read_image(file).rgb, [("", camera)], max_depth)
 
     scene, environment = lit(light_file)
     write_linear(truth / "environment.exr", environment)
     levels = np.concatenate([[0], np.round(np.arange(1, count + 1) * 255 / count)]).astype(np.uint8)
     (out / "train").mkdir(parents=True, exist_ok=True)
-    labels = instance_ids(scene, pile, camera) + 1
+    labels = instance_ids(scene.channels, pile, camera) + 1
     for k, shot in enumerate(shots):
-        ids = labels if k == 0 else instance_ids(scene, pile, shot) + 1
+        ids = labels if k == 0 else instance_ids(scene.channels, pile, shot) + 1
         cv2.imwrite(str(out / "train" / f"{k:03d}_instance_seg.png"), levels[ids])
         if not (out / "train" / f"{k:03d}_rgb.png").exists():
             write_srgb(
@@ -137,9 +141,9 @@ def synthesize_duplicates(
     for i, (name, view) in enumerate(tests):
         target = truth / "test" / f"{name}.exr"
         if not target.exists():
-            ids = instance_ids(scene, pile, view) + 1
+            ids = instance_ids(scene.channels, pile, view) + 1
             channels, alpha = (
-                render_channels(scene, view, spp=32),
+                render_channels(scene.channels, view, spp=32),
                 (ids > 0).astype(np.float32)[..., None],
             )
             for key in ("albedo", "normal"):
@@ -148,13 +152,12 @@ def synthesize_duplicates(
                 )
             for key in ("roughness", "metallic"):
                 write_linear(truth / "test" / f"{name}_{key}.exr", channels[key])
-            rgb = render(scene, view, spp=test_spp, seed=seed + 50 + i, max_depth=max_depth)[
-                ..., :3
-            ]
+            rgb = radiance(scene, view, test_spp, max_depth, seed + 50 + i)[..., :3]
             write_linear(
                 target, np.concatenate([rgb, alpha], -1)
             )  # coverage of the objects, the ground left out
         tell_progress(say, "test view", i, len(tests))
+    scene.close()
     for j, file in enumerate(relights):
         scene, light = lit(file)
         write_linear(truth / "relight" / f"{file.stem}.exr", light)
@@ -163,10 +166,9 @@ def synthesize_duplicates(
             if not target.exists():
                 write_linear(
                     target,
-                    render(
-                        scene, view, spp=test_spp, seed=seed + 90 + 40 * j + i, max_depth=max_depth
-                    ),
+                    radiance(scene, view, test_spp, max_depth, seed + 90 + 40 * j + i),
                 )
+        scene.close()
         say(f"test views under {file.stem}")
     _write_mesh(truth / "mesh.ply", mesh)
     write_glb(truth / "object.glb", mesh, material)
@@ -211,6 +213,11 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
         if key not in ("relights", "say")
     }
     plain["nodes"] = list(plain["nodes"])
+    if plain["renderer"] == "relit":  # the settings, and the hash, of captures without the choice
+        del plain["renderer"]
+        plain["max_depth"] = plain["max_depth"] or MAX_DEPTH
+    else:
+        plain["max_depth"] = depth_of(plain["renderer"], plain["max_depth"])
     identities = {what: identity_of(file) for what, file in files.items()}
     return {
         "version": VERSION,
@@ -222,10 +229,7 @@ def settings_of(asset_file: str | Path, light_file: str | Path, **options: Any) 
 
 
 def _check(o: dict, relights: list[Path]) -> None:
-    if len({f.stem for f in relights}) < len(relights):
-        raise UserError(
-            "two relighting files have one name", "the truth is kept by name", "rename one of them"
-        )
+    check_relight_names(relights)
     limits = {
         "count": (1, 255),
         "photos": (1, 12),

@@ -14,6 +14,8 @@ The folder has the layout of IRON and PIR, with what Relit measures besides unde
 
 The object: shape and colours of a GLB or OBJ. Colours are the diffuse albedo; specular albedo and
 roughness vary over the surface with the paint (three groups of colours) and slowly with the place.
+Or, with material='own', the file's own metallic-roughness material by Mitsuba's `principled`
+(`synthesize.flash_room`).
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from relit.conventions import srgb_from_linear
 from relit.errors import UserError
 from relit.files import write_text
 from relit.scene import Camera, Flash, Material, Mesh
+from relit.synthesize.flash_room import FlashRoom, as_plastic, flash_room, painted, room_light
 from relit.synthesize.multiview import (
     claim_folder,
     identity_of,
@@ -49,6 +52,8 @@ SIDE = 1024  # texels of the maps
 SPECULAR = (0.45, 1.0, 0.7)  # of the dark, the middle and the bright paint
 ALPHA = (0.30, 0.14, 0.22)
 WAVE = 0.12  # relative swing of both over the object
+# Options that came later: a capture at these values has the settings, and the hash, of before.
+LATER = {"paint": "own", "material": "plastic", "ambient": 0.0}
 MAPS = {"diffuse": "diffuse_albedo", "specular": "specular_albedo", "alpha": "specular_roughness"}
 
 
@@ -68,25 +73,25 @@ def synthesize_flash(
     offset: Sequence[float] = OFFSET,
     max_depth: int = 5,
     png: bool = False,
+    paint: str = "own",
+    material: str = "plastic",
+    ambient: float = 0.0,
     say: Callable[[str], None] = lambda text: None,
 ) -> Path:
-    """Render a flash capture of one object into `out`; returns `out`. light_file and relights stand
-    for the call's shape alone.
+    """Render a flash capture of one object into `out`; returns `out`. relights stands for the call's
+    shape alone, and light_file where `ambient` is 0.
 
     asset_file: .glb, .gltf or .obj. nodes: names of the glTF nodes to take, all where empty. spp,
     test_spp: samples a pixel of training photos and of what is measured against. offset: of the
     flash, OpenCV camera axes, where the object's radius is 0.8. png: training photos as 8-bit PNG,
-    clipped, instead of linear EXR. Deterministic by `seed`; takes up where a killed call stopped.
+    clipped, instead of linear EXR. paint: 'own', 'dark' or 'bright' colours. material: 'plastic' or
+    'own'. ambient: light of the room, light_file, as a share of the flash's mean radiance on the
+    object; in the training photos only. Deterministic by `seed`; takes up where a killed call stopped.
     Raises UserError for files that cannot be read, senseless numbers, and an `out` that holds
     something else.
     """
     asset_file, out = Path(asset_file), Path(out)
-    if light_file or relights:
-        raise UserError(
-            "a flash capture has no light but the flash",
-            fix="leave out --light and --relight",
-            code=2,
-        )
+    light = room_light(light_file, relights, ambient)
     for label, value, least in [
         ("views", views, 3),
         ("test_views", test_views, 1),
@@ -108,27 +113,37 @@ def synthesize_flash(
         "resolution": resolution,
         "spp": spp,
         "test_spp": test_spp,
+        "paint": paint,
+        "material": material,
+        "ambient": ambient,
     }
     settings = settings_of(
-        asset_file, **options, seed=seed, offset=list(offset), max_depth=max_depth, png=png
+        asset_file,
+        light_file,
+        **options,
+        seed=seed,
+        offset=list(offset),
+        max_depth=max_depth,
+        png=png,
     )
     if claim_folder(out, settings):
         return out
 
     from relit.asset.gltf import read_asset_file
-    from relit.reference.flash_scene import build_flash_scene, render_flash
 
-    mesh, material = read_asset_file(asset_file, nodes)
-    material = plastic_of(mesh, material)
+    mesh, own = read_asset_file(asset_file, nodes)
+    own = painted(own, paint)
+    plastic = plastic_of(mesh, own) if material == "plastic" else as_plastic(own)
     world_from_asset = object_frame(mesh)
     train = orbit_cameras(views, resolution, seed=seed, prefix="r_")
     test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="t_")
-    scene = build_flash_scene(mesh, material, world_from_asset)
+    room = flash_room((mesh, own, world_from_asset), plastic, material)
     write_mesh(out / "truth" / "mesh.ply", mesh, world_from_asset)
     flash = Flash(
         np.array(offset, np.float64),
-        np.full(3, flash_intensity_for(scene, train, np.array(offset, np.float64), max_depth)),
+        np.full(3, flash_intensity_for(room, train, np.array(offset, np.float64), max_depth)),
     )
+    lit = room if light is None else room.under(light, ambient, (train, flash), max_depth)
     write_text(out / "light.txt", f"{flash.intensity[0]:.8g}\n")
     write_text(
         out / "light_offset.txt", f"{AXES}\n" + " ".join(f"{v:.8g}" for v in flash.offset) + "\n"
@@ -139,21 +154,17 @@ def synthesize_flash(
         _photo(
             out / "train",
             name,
-            lambda c=camera, i=i: render_flash(
-                scene, c, flash, spp, seed=seed * 1_000_003 + i, max_depth=max_depth
-            ),
+            lambda c=camera, i=i: lit.photo(c, flash, spp, seed * 1_000_003 + i, max_depth),
             png,
         )
         tell_progress(say, "training photo", i, views)
     for i, (name, camera) in enumerate(test):
         number = seed * 1_000_003 + 500_000 + i
-        _test_maps(out, scene, name, camera)
+        _test_maps(out, room.maps, name, camera)
         _photo(
             out / "test",
             name,
-            lambda c=camera, k=number: render_flash(
-                scene, c, flash, test_spp, seed=k, max_depth=max_depth
-            ),
+            lambda c=camera, k=number: room.photo(c, flash, test_spp, k, max_depth),
             False,
         )
         tell_progress(say, "test view", i, test_views)
@@ -163,8 +174,8 @@ def synthesize_flash(
         "sphere": {"centre": [0.0, 0.0, 0.0], "radius": 0.8},
     }
     names = {"train": [n for n, _ in train], "test": [n for n, _ in test]}
-    light = {"offset": flash.offset.tolist(), "intensity": flash.intensity.tolist()}
-    write_json(out / "truth" / "truth.json", {**head, **names, "flash": light, "ior": material.ior})
+    lamp = {"offset": flash.offset.tolist(), "intensity": flash.intensity.tolist()}
+    write_json(out / "truth" / "truth.json", {**head, **names, "flash": lamp, "ior": plastic.ior})
     return out
 
 
@@ -182,7 +193,10 @@ def settings_of(asset_file: str | Path, light_file=(), **options: Any) -> dict[s
         key: list(value) if isinstance(value, (tuple, list)) else value
         for key, value in plain.items()
     }
-    return {"version": VERSION, "kind": "flash", "asset": identity_of(asset), **plain}
+    plain = {k: v for k, v in plain.items() if k not in LATER or v != LATER[k]}
+    light = room_light(light_file, (), plain.get("ambient", 0.0))
+    more = {} if light is None else {"light": identity_of(light)}
+    return {"version": VERSION, "kind": "flash", "asset": identity_of(asset), **more, **plain}
 
 
 # ---------------------------------------------------------------- the material
@@ -253,22 +267,14 @@ def slow_wave(mesh: Mesh, shape: tuple[int, int]) -> np.ndarray:
 
 
 def flash_intensity_for(
-    scene, cameras: Sequence[tuple[str, Camera]], offset: np.ndarray, max_depth: int
+    room: FlashRoom, cameras: Sequence[tuple[str, Camera]], offset: np.ndarray, max_depth: int
 ) -> float:
     """The intensity that puts the 95th percentile, over the object's pixels in 6 small views, of
     the brightest channel at WHITE."""
-    from relit.reference.flash_scene import render_flash
-
     values = []
     for i in np.unique(np.linspace(0, len(cameras) - 1, min(6, len(cameras))).round().astype(int)):
-        picture = render_flash(
-            scene,
-            cameras[i][1].resized(100, 100),
-            Flash(offset, np.ones(3)),
-            32,
-            seed=int(i),
-            max_depth=max_depth,
-        )
+        small = cameras[i][1].resized(100, 100)
+        picture = room.photo(small, Flash(offset, np.ones(3)), 32, int(i), max_depth)
         values.append(picture[..., :3][picture[..., 3] > 0.99].max(-1))
     values = np.concatenate(values)
     if not values.size or not np.percentile(values, 95) > 0:

@@ -110,7 +110,7 @@ def synthesize_multiview(
     max_depth = depth_of(renderer, max_depth)
     _check_counts(views, test_views, resolution, spp, test_spp)
     _check_material(roughness, metallic)
-    _check_names(relights)
+    check_relight_names(relights)
     settings = settings_of(
         asset_file,
         light_file,
@@ -172,7 +172,7 @@ def synthesize_multiview(
         for i, (name, camera) in enumerate(test):
             number = seed * 1_000_003 + 600_000 + 1000 * j + i
             target = folder / f"{Path(name).name}.exr"
-            _write_radiance(target, scene, camera, test_spp, max_depth, number)
+            write_radiance(target, scene, camera, test_spp, max_depth, number)
             tell_progress(say, f"test view under {file.stem}", i, test_views)
         scene.close()
 
@@ -182,7 +182,7 @@ def synthesize_multiview(
         {
             "settings": settings,
             "renderer": made_by,
-            "ceiling": ceilings(thing, _lights_of(truth, relights, test), test_spp, seed, say),
+            "ceiling": ceilings(thing, files_of_lights(truth, relights, test), test_spp, seed, say),
             "world_from_asset": thing.world_from_asset.tolist(),
             "sphere": {"centre": [0.0, 0.0, 0.0], "radius": RADIUS},
             "ior": material.ior,
@@ -238,7 +238,7 @@ def _write_training_photos(
         tell_progress(sampling.say, "training photo", i, len(plan.cameras))
 
 
-def _write_radiance(
+def write_radiance(
     target: Path, scene: TruthScene, camera: Camera, spp: int, max_depth: int, seed: int
 ) -> None:
     """Render `target`, unless it is there."""
@@ -248,7 +248,7 @@ def _write_radiance(
         write_linear(target, radiance(scene, camera, spp, max_depth, seed))
 
 
-def _lights_of(
+def files_of_lights(
     truth: Path, relights: Sequence[Path], test: Sequence[tuple[str, Camera]]
 ) -> dict[str, tuple[Path, list[tuple[Path, Camera]]]]:
     """For each light of a capture its file and the test pictures under it."""
@@ -404,7 +404,8 @@ def write_test_view(
 # ---------------------------------------------------------------- files
 
 
-def _check_names(relights: Sequence[Path]) -> None:
+def check_relight_names(relights: Sequence[Path]) -> None:
+    """Raise UserError for lights that the truth cannot keep by name."""
     if len({f.stem for f in relights}) < len(relights):
         raise UserError(
             "two relighting files have one name", "the truth is kept by name", "rename one of them"

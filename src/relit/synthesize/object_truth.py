@@ -23,10 +23,12 @@ import numpy as np
 from relit.errors import EXIT_USAGE, UserError
 from relit.images import read_image, write_linear
 from relit.scene import Camera, Material, Mesh
+from relit.synthesize.ceiling import ceilings
 from relit.synthesize.delivery import Delivery
 from relit.synthesize.multiview import (
     RADIUS,
     exposure_factor,
+    files_of_lights,
     identity_of,
     object_frame,
     overridden,
@@ -36,6 +38,7 @@ from relit.synthesize.multiview import (
     write_scale_view,
     write_test_view,
 )
+from relit.synthesize.renderers import TrueObject
 from relit.synthesize.surroundings import MAX_DEPTH
 
 SCALE_VIEWS = 8
@@ -197,7 +200,9 @@ def write_object_truth(
                 number = seed + 600_000 + 1000 * j + i
                 write_linear(target, radiance(lit, camera, spp, MAX_DEPTH, number))
             tell_progress(t.say, f"test view under {file.stem}", i, len(test))
+    lights = files_of_lights(truth, files.relights, test)
     return {
+        "ceiling": ceilings(TrueObject(*t.thing), lights, spp, t.sampling.seed, t.say),
         "world_from_asset": t.world_from_asset.tolist(),
         "sphere": {"centre": [0.0, 0.0, 0.0], "radius": RADIUS},
         "ior": t.material.ior,
