@@ -51,7 +51,8 @@ def benchmark_flags(parser: Parser) -> None:
     from relit.benchmark.splits import SPLIT_NAMES
     from relit.benchmark.suites import SUITES
 
-    parser.add_argument("suite", nargs="?", help=f"name of a suite: {', '.join(SUITES)}")
+    names = ", ".join(name for name in SUITES if name != "registration")
+    parser.add_argument("suite", nargs="?", help=f"{names} or registration")
     job_flags(parser, "standard")
     add = parser.common.add_argument
     add("--json", type=Path, default=None, metavar="FILE", help="write the record of the run there")
