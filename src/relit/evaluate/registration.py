@@ -78,14 +78,14 @@ def evaluate_registration(
         raise UserError("the run has not found poses", fix=fix)
     arrays = load_arrays(folder / "result.npz")
     if (truth_folder / "transforms_train.json").is_file():
-        values, views = pile_figures(pile_of(arrays), load_pile_truth(truth_folder), seed)
+        values, views = pile_figures(found_pile(arrays), load_pile_truth(truth_folder), seed)
     else:
         values, views = collection_figures(arrays, truth_folder), {}
     values["seconds_poses"] = float((read_json(folder / "DONE") or {}).get("seconds", np.nan))
     return {"metrics": entries(values, DEFINITIONS), "per_view": views}
 
 
-def pile_of(arrays: dict[str, np.ndarray]) -> FoundPile:
+def found_pile(arrays: dict[str, np.ndarray]) -> FoundPile:
     """The instances of the first photo."""
     poses, chances = {}, {}
     for i in range(int(arrays["ids.#"])):

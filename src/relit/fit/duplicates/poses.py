@@ -27,9 +27,6 @@ from relit.geometry.se3 import rotation_angle
 from relit.recipe import FitContext
 from relit.scene import Camera, Pixels
 
-# degrees between what an object shows and what the next one does from which on the search is often
-# wrong
-FAR = 45.0
 APART = 100.0  # degrees between two groups of sides from which on hardly anything is shown by both
 # half instances that are added to the number of them where the effort of the search is limited: few
 # take more tries than many
@@ -116,7 +113,7 @@ def find_pile_poses(shots: list[Shot], fit: FitContext) -> PilePoses:
         asked = leave_out(some, poses[registered], search, seed)
         chances[registered], contradicted = asked.chance_wrong, asked.contradicted
         turns[registered] = np.where(asked.chance_wrong >= UNCERTAIN, asked.away, 0)
-    say_far_apart(some, poses[registered], run)
+    say_groups(some, poses[registered], run)
     if matched and not {"guided", "refinement"} & set(options.without):
         poses = adjusted_poses(matched, poses, registered, run)
     return PilePoses(
@@ -167,34 +164,28 @@ def linked_together(count: int, told: tuple) -> np.ndarray:
     return member == np.bincount(member).argmax()
 
 
-def say_far_apart(views: list[InstanceView], poses: np.ndarray, run) -> None:
-    """Say where the objects, at poses (N, 4, 4), show sides so different that their poses are
-    uncertain whatever their scores."""
-    sides = viewing_directions(poses)
-    if len(sides) < 2:
+def say_groups(views: list[InstanceView], poses: np.ndarray, run) -> None:
+    """Say where the objects, at poses (N, 4, 4), fall into two groups that share no side: each bears
+    its own poses out, whatever those of the other are."""
+    if len(views) < 3:
         return
-    away = np.degrees(np.arccos(np.clip(sides @ sides.T, -1, 1)))
-    apart = np.median((away + 360 * np.eye(len(sides))).min(1))
-    if apart > FAR:
-        run.say(
-            f"note: the sides that the objects show lie {apart:.0f} degrees apart (each from the next one, median), and the search is "
-            f"often wrong beyond {FAR:.0f}: look at the rendered photo in the report; more objects or another photo of the pile help"
+    sides = viewing_directions(poses)
+    gap, group = widest_gap(np.degrees(np.arccos(np.clip(sides @ sides.T, -1, 1))))
+    if gap <= APART:
+        return
+    one, other = (
+        ", ".join(
+            instance_name(v).removeprefix("label ")
+            for v, g in zip(views, group, strict=True)
+            if g == n
         )
-    gap, group = widest_gap(away)
-    if gap > APART and len(sides) > 2:
-        one, other = (
-            ", ".join(
-                instance_name(v).removeprefix("label ")
-                for v, g in zip(views, group, strict=True)
-                if g == n
-            )
-            for n in (0, 1)
-        )
-        run.say(
-            f"note: labels {one} and labels {other} are placed as showing opposite sides of the object, {gap:.0f} degrees apart with none "
-            "between: each group may agree with itself and yet be turned against the other; look at the object in the report; more objects "
-            "or another photo of the pile help"
-        )
+        for n in (0, 1)
+    )
+    run.say(
+        f"note: labels {one} and labels {other} are placed as showing opposite sides of the object, {gap:.0f} degrees apart with none "
+        "between: each group may agree with itself and yet be turned against the other; look at the object in the report; more objects "
+        "or another photo of the pile help"
+    )
 
 
 def widest_gap(away: np.ndarray) -> tuple[float, np.ndarray]:
