@@ -1,43 +1,131 @@
-"""Masks by a learned segmenter that runs in ONNX Runtime (rembg), an optional extra."""
+"""Masks by a network for salient objects (IS-Net, U2-Net) in ONNX Runtime, an optional extra.
+
+The network is told by the side of its input: 1024 pixels IS-Net, (code - 128) / 256; 320 pixels
+U2-Net, codes over 255 normalised as ImageNet's. The first output is the mask, in [0, 1].
+"""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
 import numpy as np
 
 from relit.conventions import srgb_from_linear
 from relit.errors import EXIT_ENVIRONMENT, UserError
+from relit.files import cache_folder
+from relit.masks.weights import COMMAND, find_segmenter
+
+VERSION = 1  # of what is made of a network's output; part of the names of kept masks
 
 
-def segmenter(model: str = "u2net"):
-    """A function linear (H, W, 3) -> mask (H, W) float32 in [0, 1]. Raises UserError when the extra
-    or its weights are not there."""
+@dataclass(frozen=True)
+class Kind:
+    """A kind of network. mean, spread: of sRGB codes in [0, 255]; the input is (codes - mean) /
+    spread."""
+
+    name: str
+    mean: tuple[float, float, float]
+    spread: tuple[float, float, float]
+
+
+KINDS = {  # side of the input in pixels -> kind
+    1024: Kind("IS-Net", (128.0,) * 3, (256.0,) * 3),
+    320: Kind(
+        "U2-Net",
+        (0.485 * 255, 0.456 * 255, 0.406 * 255),
+        (0.229 * 255, 0.224 * 255, 0.225 * 255),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Segmenter:
+    """A network in memory. file: of it. session: of ONNX Runtime. side: of its input, pixels."""
+
+    file: Path
+    session: Any
+    side: int
+
+    @property
+    def name(self) -> str:
+        return f"{KINDS[self.side].name} ({self.file.name})"
+
+    def __call__(self, rgb: np.ndarray) -> np.ndarray:
+        """(H, W, 3) linear -> mask (H, W) float32 in [0, 1]."""
+        h, w = rgb.shape[:2]
+        codes = np.clip(srgb_from_linear(rgb), 0, 1).astype(np.float32) * 255
+        size = (self.side, self.side)
+        kind = KINDS[self.side]
+        shown = cv2.resize(codes, size, interpolation=cv2.INTER_AREA if h > self.side else 1)
+        blob = (shown - np.float32(kind.mean)) / np.float32(kind.spread)  # pyright: ignore
+        given = {self.session.get_inputs()[0].name: blob.transpose(2, 0, 1)[None]}
+        out = np.asarray(self.session.run(None, given)[0], np.float32)
+        return np.clip(cv2.resize(out.reshape(self.side, self.side), (w, h)), 0, 1)
+
+    def kept(self, photo: Path, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """The mask of a photo from an earlier call, else what it says of `make()` (H, W, 3) linear,
+        which is kept in the cache by the contents of the photo and the network's name and size."""
+        told = hashlib.sha256(photo.read_bytes())
+        told.update(f"{VERSION} {self.file.name} {self.file.stat().st_size}".encode())
+        file = cache_folder(None) / "masks" / f"{told.hexdigest()[:32]}.png"
+        rgb = make()
+        if file.is_file():
+            codes = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+            if codes is not None and codes.shape == rgb.shape[:2]:
+                return codes.astype(np.float32) / 255
+        mask = self(rgb)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), np.round(mask * 255).astype(np.uint8))
+        return mask
+
+
+def runtime() -> Any:
+    """The module onnxruntime, None where it is not installed."""
     try:
-        import rembg  # pyright: ignore[reportMissingImports]
-    except (
-        ImportError,
-        SystemExit,
-    ) as error:  # rembg leaves the interpreter when ONNX Runtime is missing
+        import onnxruntime  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    return onnxruntime
+
+
+def at_hand() -> bool:
+    """Whether photos can be segmented without fetching anything."""
+    return find_segmenter() is not None and runtime() is not None
+
+
+def segmenter(name: str = "") -> Segmenter:
+    """The segmenter `name` (see `find_segmenter`). Raises UserError where the extra or the weights are
+    missing, or the file is no such network."""
+    file, module = find_segmenter(name), runtime()
+    if module is None:
         raise UserError(
             "masks by segmentation need an optional package",
-            "rembg or onnxruntime is not installed",
+            "onnxruntime is not installed",
             "pip install 'relit[segment]', or give mask files, or use --masks grabcut",
             code=EXIT_ENVIRONMENT,
-        ) from error
-    try:
-        session = rembg.new_session(model)
-    except Exception as error:  # rembg raises whatever its downloader raises
-        raise UserError(
-            f"the segmenter '{model}' could not be started",
-            str(error)[:200],
-            "its weights are fetched once: connect to the network, or put the .onnx file into ~/.u2net",
-            code=EXIT_ENVIRONMENT,
-        ) from error
-
-    def mask_of(rgb: np.ndarray) -> np.ndarray:
-        codes = (np.clip(srgb_from_linear(rgb), 0, 1) * 255 + 0.5).astype(np.uint8)
-        return (
-            np.asarray(rembg.remove(codes, session=session, only_mask=True), dtype=np.float32)
-            / 255.0
         )
-
-    return mask_of
+    if file is None:
+        raise UserError(
+            "no weights of a segmenter are at hand",
+            "nothing is downloaded unless asked for",
+            f"call {COMMAND} once, or give --masks segment:FILE.onnx",
+            code=EXIT_ENVIRONMENT,
+        )
+    try:
+        session = module.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        side = session.get_inputs()[0].shape[-1]
+    except Exception as error:  # ONNX Runtime raises classes of its own for damaged files
+        first = str(error).strip().splitlines()[0][:200]
+        raise UserError("the network cannot be read", first, f"give an ONNX file: {file}") from None
+    if side not in KINDS:
+        raise UserError(
+            f"the network takes pictures of {side} pixels a side",
+            f"known are {', '.join(f'{k.name} ({n})' for n, k in KINDS.items())}",
+            f"give one of these: {file}",
+        )
+    return Segmenter(file, session, side)
