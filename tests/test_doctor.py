@@ -104,7 +104,7 @@ def test_missing_wheels_and_extras(monkeypatch, tmp_path):
         and check.found == "not installed: no-such-wheel"
         and check.fix == "make setup"
     )
-    for name in ("imageio_ffmpeg", "rembg", "onnxruntime", "pillow_heif", "rawpy"):
+    for name in ("imageio_ffmpeg", "onnxruntime", "pillow_heif", "rawpy"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setenv("PATH", str(tmp_path))
     extras = doctor._extras()

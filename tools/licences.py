@@ -30,7 +30,6 @@ STATED = {
     "OpenEXR": "BSD-3-Clause",
     "pillow-heif": "BSD-3-Clause; its wheel carries libheif (LGPL-3.0)",
     "rawpy": "MIT; its wheel carries LibRaw (LGPL-2.1 or CDDL-1.0)",
-    "rembg": "MIT; the weights that it fetches have licences of their own",
     "onnxruntime": "MIT",
     "bpy": "GPL-3.0; Relit runs it in a process of its own and never imports it",
     "imageio-ffmpeg": "BSD-2-Clause; its wheel carries ffmpeg (GPL)",

@@ -285,8 +285,8 @@ def _extras() -> list[Check]:
         module("ffmpeg", ("imageio_ffmpeg",), "imageio-ffmpeg", "H.264 videos (otherwise MPEG-4)"),
         module(
             "segmenter",
-            ("rembg", "onnxruntime"),
-            "rembg onnxruntime",
+            ("onnxruntime",),
+            "onnxruntime",
             "masks by a segmentation network",
         ),
         module("HEIC", ("pillow_heif",), "pillow-heif", "HEIC photos of phones"),

@@ -179,12 +179,12 @@ def write_model(path):
 
 
 def test_the_segmenter_runs_a_network_from_the_folder_of_weights(tmp_path, monkeypatch):
-    pytest.importorskip("rembg", reason="needs rembg and onnxruntime (the extra `segment`)")
-    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+    pytest.importorskip("onnxruntime", reason="needs onnxruntime (the extra `segment`)")
+    monkeypatch.setenv("RELIT_CACHE", str(tmp_path / "cache"))
     write_model(tmp_path / "u2net.onnx")
     picture = np.full((60, 90, 3), 0.05, np.float32)
     picture[20:40, 30:60] = (0.05, 0.05, 0.9)
-    mask = segmenter()(picture)
+    mask = segmenter(str(tmp_path / "u2net.onnx"))(picture)
     assert mask.shape == (60, 90) and mask.dtype == np.float32
     inside = np.zeros((60, 90), bool)
     inside[20:40, 30:60] = True
@@ -192,8 +192,9 @@ def test_the_segmenter_runs_a_network_from_the_folder_of_weights(tmp_path, monke
 
 
 def test_a_capture_with_the_segmenters_masks(tmp_path, monkeypatch):
-    pytest.importorskip("rembg", reason="needs rembg and onnxruntime (the extra `segment`)")
-    monkeypatch.setenv("U2NET_HOME", str(tmp_path / "weights"))
+    pytest.importorskip("onnxruntime", reason="needs onnxruntime (the extra `segment`)")
+    monkeypatch.setenv("RELIT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("RELIT_SEGMENTER", str(tmp_path / "weights" / "u2net.onnx"))
     write_model(tmp_path / "weights" / "u2net.onnx")
     from relit.capture.open import open_capture
 

@@ -148,7 +148,7 @@ def test_masks_with_a_palette(tmp_path, colours, expected):
 def test_a_missing_segmenter_says_what_to_install(monkeypatch):
     import sys
 
-    monkeypatch.setitem(sys.modules, "rembg", None)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(UserError, match="optional package") as caught:
         segment.segmenter()
     assert caught.value.code == EXIT_ENVIRONMENT and "relit[segment]" in caught.value.fix

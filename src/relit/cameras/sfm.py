@@ -199,10 +199,10 @@ def _plan(
     first = replace(STANDARD, inliers=15, start=40, start_angle=8.0) if few else STANDARD
     first = replace(first, upsampled=few or not large)
     plan = [first, LOOSE]
-    if (
-        has_masks and not capture.black_background
-    ):  # the surroundings may carry the texture that the object lacks
-        plan.append(replace(LOOSE, title=LOOSE.title + ", without masks", with_masks=False))
+    if has_masks and not capture.black_background:
+        # the surroundings may carry the texture that the object lacks, and a try is quick
+        alone = [replace(s, title=s.title + ", without masks", with_masks=False) for s in plan]
+        plan = [first, alone[0], LOOSE, alone[1]]
     if not focals_known and not any(p.focal_hint for p in photos):
         plan.append(
             replace(

@@ -3,6 +3,8 @@ or a network."""
 
 from __future__ import annotations
 
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +17,15 @@ from relit.capture.listing import listed
 from relit.capture.mask_edges import is_turned
 from relit.errors import UserError
 from relit.images import Header, Image, read_small, turn_upright
+from relit.log import readable_seconds
 from relit.masks.files import FOLDERS, find_mask, index_masks, judge, read_counted
-from relit.masks.segment import segmenter
+from relit.masks.segment import at_hand, segmenter
 from relit.masks.threshold import Backdrop, black_frame, find_backdrop
+from relit.masks.weights import COMMAND as WEIGHTS_COMMAND
 from relit.scene import Photo
 
 SMALL = 256  # pixels, longest side of the copies that masks are judged on
+SILENT = 3.0  # seconds of segmenting after which progress is shown
 PANORAMA = "EQUIRECTANGULAR"  # COLMAP's model
 LOOKED_AT = 12  # photos that are looked at for a plain backdrop
 
@@ -67,16 +72,16 @@ def masked(
         if result is not None:
             return result
     if wanted.startswith("segment"):
-        mask_of = segmenter(*wanted.split(":", 1)[1:])
-        masked, small = [], []
-        for p in photos:
-            m = mask_of(p.load().rgb)
-            masked.append(photo.with_mask(p, m))
-            scale = min(1.0, SMALL / max(m.shape))
-            small.append(cv2.resize(m, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-        _say_empty(judge(_named(reading, small), "the segmenter")[1], notes)
-        notes.append("masks were found by the segmenter; look at them")
-        return masked, small, False
+        return (*_from_segmenter(reading, photos, "".join(wanted.split(":", 1)[1:]), notes), False)
+    if wanted == "auto" and at_hand():
+        try:
+            return (*_from_segmenter(reading, photos, "", notes), False)
+        except UserError as error:
+            notes.append(f"the segmenter's masks are not used: {error.what}")
+    elif wanted == "auto":
+        notes.append(
+            f"no masks: everything in the photos is reconstructed; with the extra `segment` and `{WEIGHTS_COMMAND}` the object is cut out"
+        )
     return photos, none, False
 
 
@@ -97,6 +102,23 @@ def _say_empty(empty: list[str], notes: list[str]) -> None:
         notes.append(
             f"{len(empty)} photos have an empty mask and are not used, for example {empty[0]}"
         )
+
+
+def _from_segmenter(reading: Reading, photos: list[Photo], name: str, notes: list[str]):
+    """(photos, small masks) by a network; masks of earlier calls are read back. Raises UserError
+    where the network is missing, or its masks tell nothing."""
+    network = segmenter(name)
+    found, small, began = [], [], time.monotonic()
+    for k, p in enumerate(photos):
+        m = network.kept(p.load.path, lambda p=p: p.load().rgb)
+        found.append(photo.with_mask(p, m))
+        small.append(_shrunk(m))
+        if (took := time.monotonic() - began) > SILENT and sys.stderr.isatty():
+            left = readable_seconds(took / (k + 1) * (len(photos) - k - 1))
+            print(f"\rmasks: {k + 1} of {len(photos)}, {left} left ", end="", file=sys.stderr)
+    _say_empty(judge(_named(reading, small), "the segmenter")[1], notes)
+    notes.append(f"masks were found by the segmenter {network.name}; look at them")
+    return found, small
 
 
 def _from_runs(reading: Reading, photos: list[Photo], notes: list[str]):

@@ -78,7 +78,7 @@ def open_capture(
 
     sphere: the object sphere in the units of the cameras; found when not given. masks: 'auto' takes
     alpha channels, else mask files, else a plain backdrop, else none; 'none', 'alpha', 'files',
-    'threshold', 'grabcut', 'segment' ask for one kind, and 'segment:NAME' for a network of rembg's
+    'threshold', 'grabcut', 'segment' ask for one kind, and 'segment:FILE.onnx' for a network
     other than its U^2-Net.
     max_side: photos are resized to at most so many pixels. min_photos: fewer photos are an error.
     focal: pixels, of a photo of duplicates. labels: False reads labelled photos like any others.

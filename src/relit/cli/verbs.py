@@ -21,6 +21,7 @@ from relit.cli.jobs import (
 from relit.cli.measure import benchmark_flags, do_benchmark, do_evaluate, evaluate_flags
 from relit.cli.parser import Parser, Verb
 from relit.cli.synthesizers import SYNTHESIZERS, do_synthesize, synthesize_flags
+from relit.cli.weights import do_weights, weights_flags
 
 VERBS: dict[str, Verb] = {
     "doctor": Verb(
@@ -37,6 +38,11 @@ VERBS: dict[str, Verb] = {
         "check photos, cameras, masks and light before a reconstruction",
         inspect_flags,
         do_inspect,
+    ),
+    "weights": Verb(
+        "fetch the weights of the segmenter, with their licence; nothing else downloads",
+        weights_flags,
+        do_weights,
     ),
     "quadrants": Verb(
         "enter rough viewpoints of the photos of a collection", quadrants_flags, do_quadrants
