@@ -34,7 +34,7 @@ class Kind:
 
 
 KINDS = {  # side of the input in pixels -> kind
-    1024: Kind("IS-Net", (128.0,) * 3, (256.0,) * 3),
+    1024: Kind("IS-Net", (128.0, 128.0, 128.0), (256.0, 256.0, 256.0)),
     320: Kind(
         "U2-Net",
         (0.485 * 255, 0.456 * 255, 0.406 * 255),
