@@ -35,7 +35,7 @@ def network(tmp_path, monkeypatch):
     monkeypatch.setenv("RELIT_CACHE", str(tmp_path / "cache"))
     file = tmp_path / "mine.onnx"
     file.write_bytes(b"weights")
-    return lambda side: Segmenter(file, Session(), side)
+    return lambda side: Segmenter(file, Session(), side, "sum")
 
 
 @pytest.mark.parametrize("side", KINDS)
@@ -123,3 +123,29 @@ def test_a_real_network_cuts_a_toy_from_its_turntable(tmp_path, monkeypatch):
     orange = rgb[..., 0] > 1.5 * rgb[..., 2]  # the toy; table and wall are blue
     both = (mask > 0.5) & orange
     assert both.sum() / ((mask > 0.5) | orange).sum() > 0.8
+
+
+class Middle:
+    """A network whose mask is the middle of the photo."""
+
+    name = "the middle"
+
+    def kept(self, path, make):
+        mask = np.zeros(make().shape[:2], np.float32)
+        h, w = mask.shape
+        mask[h // 4 : -h // 4, w // 4 : -w // 4] = 1
+        return mask
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_masks_by_a_threshold_are_believed_where_the_segmenter_agrees(monkeypatch, same):
+    from relit.capture import mask_sources
+
+    monkeypatch.setattr(mask_sources, "at_hand", lambda: True)
+    monkeypatch.setattr(mask_sources, "segmenter", Middle)
+    load = lambda: SimpleNamespace(rgb=np.zeros((80, 120, 3)))  # noqa: E731
+    load.path = None
+    small = np.zeros((40, 60), np.float32)
+    small[(slice(10, 30), slice(15, 45)) if same else (slice(0, 12), slice(0, 60))] = 1
+    doubt = mask_sources._doubt([SimpleNamespace(load=load)] * 5, [small, None, small, small, None])
+    assert (doubt == "") == same and (same or "in 3 photos" in doubt)

@@ -18,13 +18,26 @@ from relit.capture.mask_edges import is_turned
 from relit.errors import UserError
 from relit.images import Header, Image, read_small, turn_upright
 from relit.log import readable_seconds
-from relit.masks.files import FOLDERS, find_mask, index_masks, judge, read_counted
+from relit.masks.files import (
+    FOLDERS,
+    border_share,
+    find_mask,
+    index_masks,
+    judge,
+    read_counted,
+)
 from relit.masks.segment import at_hand, segmenter
 from relit.masks.threshold import Backdrop, black_frame, find_backdrop
 from relit.masks.weights import COMMAND as WEIGHTS_COMMAND
 from relit.scene import Photo
 
 SMALL = 256  # pixels, longest side of the copies that masks are judged on
+# share of a photo's border that a mask before a plain backdrop may cover, and share of the photos
+# in which it may cover more: objects are cut by the frame now and then
+SPILL, SPILLED = 0.2, 0.25
+# photos in which a threshold's masks are compared with the segmenter's, and the median overlap from
+# which on they are alike
+COMPARED, ALIKE = 6, 0.7
 SILENT = 3.0  # seconds of segmenting after which progress is shown
 PANORAMA = "EQUIRECTANGULAR"  # COLMAP's model
 LOOKED_AT = 12  # photos that are looked at for a plain backdrop
@@ -68,8 +81,11 @@ def masked(
         if result is not None:
             return result
     if wanted in ("auto", "threshold"):
-        result = _from_backdrop(reading, photos, wanted == "threshold", notes)
-        if result is not None:
+        said: list[str] = []
+        result = _from_backdrop(reading, photos, wanted == "threshold", said)
+        doubt = _doubt(photos, result[1]) if result is not None and wanted == "auto" else ""
+        notes += [doubt] if doubt else said
+        if result is not None and not doubt:
             return result
     if wanted.startswith("segment"):
         return (*_from_segmenter(reading, photos, "".join(wanted.split(":", 1)[1:]), notes), False)
@@ -104,6 +120,34 @@ def _say_empty(empty: list[str], notes: list[str]) -> None:
         )
 
 
+def _doubt(photos: list[Photo], small: list) -> str:
+    """Why masks by a threshold are not used, '' where they are: a surface that the object lies on can
+    pass for a plain backdrop in each photo alone. small: masks (h, w) or None of all photos. They are
+    compared with the segmenter's, where that is at hand, in a few photos."""
+    known = [k for k, m in enumerate(small) if m is not None]
+    if not at_hand() or not known:
+        return ""
+    try:
+        network = segmenter()
+    except UserError:  # a damaged file takes nothing from photos that do not need it
+        return ""
+    overlaps = []
+    for k in known[:: -(-len(known) // COMPARED)]:
+        p = photos[k]
+        mask = network.kept(p.load.path, lambda p=p: p.load().rgb)
+        size = small[k].shape[1::-1]
+        other = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5
+        own = small[k] > 0.5
+        overlaps.append((own & other).sum() / max(int((own | other).sum()), 1))
+    overlap = float(np.median(overlaps))
+    if overlap >= ALIKE:
+        return ""
+    return (
+        "a threshold before a plain backdrop and the segmenter disagree (intersection over union "
+        f"{overlap:.2f} in {len(overlaps)} photos): the segmenter's masks are used; --masks threshold takes the others"
+    )
+
+
 def _from_segmenter(reading: Reading, photos: list[Photo], name: str, notes: list[str]):
     """(photos, small masks) by a network; masks of earlier calls are read back. Raises UserError
     where the network is missing, or its masks tell nothing."""
@@ -116,6 +160,8 @@ def _from_segmenter(reading: Reading, photos: list[Photo], name: str, notes: lis
         if (took := time.monotonic() - began) > SILENT and sys.stderr.isatty():
             left = readable_seconds(took / (k + 1) * (len(photos) - k - 1))
             print(f"\rmasks: {k + 1} of {len(photos)}, {left} left ", end="", file=sys.stderr)
+    if time.monotonic() - began > SILENT and sys.stderr.isatty():
+        print(file=sys.stderr)
     _say_empty(judge(_named(reading, small), "the segmenter")[1], notes)
     notes.append(f"masks were found by the segmenter {network.name}; look at them")
     return found, small
@@ -276,6 +322,13 @@ def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: li
         None if f.held_out else backdrop(_small(p).rgb)
         for f, p in zip(reading.frames, photos, strict=True)
     ]
+    spilled = np.mean([border_share(m) > SPILL for m in small if m is not None])
+    if not asked and spilled > SPILLED:
+        notes.append(
+            f"the borders of the photos are nearly of one colour, but masks by a threshold reach them in {spilled:.0%} of the photos: "
+            "the object lies on something that is no plain backdrop, and the threshold is not used"
+        )
+        return None
     _, empty = judge(_named(reading, small), "the threshold")
     _say_empty(empty, notes)
     kind = "dark" if backdrop.dark else "plain"

@@ -77,9 +77,9 @@ def open_capture(
     """Read a capture of any known format; photos decode later, when `Photo.load` is called.
 
     sphere: the object sphere in the units of the cameras; found when not given. masks: 'auto' takes
-    alpha channels, else mask files, else a plain backdrop, else none; 'none', 'alpha', 'files',
-    'threshold', 'grabcut', 'segment' ask for one kind, and 'segment:FILE.onnx' for a network
-    other than its U^2-Net.
+    alpha channels, else mask files, else a plain backdrop, else a segmenter, else none; 'none', 'alpha', 'files',
+    'threshold', 'grabcut', 'segment' ask for one kind, and 'segment:FILE.onnx' for a network of the
+    user's.
     max_side: photos are resized to at most so many pixels. min_photos: fewer photos are an error.
     focal: pixels, of a photo of duplicates. labels: False reads labelled photos like any others.
     Raises UserError (exit code 3) for everything that is wrong with the input.

@@ -7,6 +7,7 @@ U2-Net, codes over 255 normalised as ImageNet's. The first output is the mask, i
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy as np
 from relit.conventions import srgb_from_linear
 from relit.errors import EXIT_ENVIRONMENT, UserError
 from relit.files import cache_folder
-from relit.masks.weights import COMMAND, find_segmenter
+from relit.masks.weights import COMMAND, find_segmenter, sum_of
 
 VERSION = 1  # of what is made of a network's output; part of the names of kept masks
 
@@ -45,11 +46,13 @@ KINDS = {  # side of the input in pixels -> kind
 
 @dataclass(frozen=True)
 class Segmenter:
-    """A network in memory. file: of it. session: of ONNX Runtime. side: of its input, pixels."""
+    """A network in memory. file: of it, sum: its SHA-256. session: of ONNX Runtime. side: of its
+    input, pixels."""
 
     file: Path
     session: Any
     side: int
+    sum: str
 
     @property
     def name(self) -> str:
@@ -61,7 +64,7 @@ class Segmenter:
         codes = np.clip(srgb_from_linear(rgb), 0, 1).astype(np.float32) * 255
         size = (self.side, self.side)
         kind = KINDS[self.side]
-        shown = cv2.resize(codes, size, interpolation=cv2.INTER_AREA if h > self.side else 1)
+        shown = cv2.resize(codes, size, interpolation=cv2.INTER_AREA)
         blob = (shown - np.float32(kind.mean)) / np.float32(kind.spread)  # pyright: ignore
         given = {self.session.get_inputs()[0].name: blob.transpose(2, 0, 1)[None]}
         out = np.asarray(self.session.run(None, given)[0], np.float32)
@@ -69,18 +72,20 @@ class Segmenter:
 
     def kept(self, photo: Path, make: Callable[[], np.ndarray]) -> np.ndarray:
         """The mask of a photo from an earlier call, else what it says of `make()` (H, W, 3) linear,
-        which is kept in the cache by the contents of the photo and the network's name and size."""
-        told = hashlib.sha256(photo.read_bytes())
-        told.update(f"{VERSION} {self.file.name} {self.file.stat().st_size}".encode())
-        file = cache_folder(None) / "masks" / f"{told.hexdigest()[:32]}.png"
+        which is kept in the cache by the contents of the photo and of the network."""
         rgb = make()
+        told = hashlib.sha256(photo.read_bytes())
+        told.update(f"{VERSION} {self.sum} {rgb.shape[:2]}".encode())
+        file = cache_folder(None) / "masks" / f"{told.hexdigest()[:32]}.png"
         if file.is_file():
             codes = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
             if codes is not None and codes.shape == rgb.shape[:2]:
                 return codes.astype(np.float32) / 255
         mask = self(rgb)
         file.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(file), np.round(mask * 255).astype(np.uint8))
+        part = file.with_name(f".{os.getpid()}-{file.name}")
+        cv2.imwrite(str(part), np.round(mask * 255).astype(np.uint8))
+        part.replace(file)
         return mask
 
 
@@ -94,8 +99,9 @@ def runtime() -> Any:
 
 
 def at_hand() -> bool:
-    """Whether photos can be segmented without fetching anything."""
-    return find_segmenter() is not None and runtime() is not None
+    """Whether photos can be segmented without fetching anything. Raises UserError where
+    RELIT_SEGMENTER names no file."""
+    return runtime() is not None and find_segmenter() is not None
 
 
 def segmenter(name: str = "") -> Segmenter:
@@ -124,8 +130,8 @@ def segmenter(name: str = "") -> Segmenter:
         raise UserError("the network cannot be read", first, f"give an ONNX file: {file}") from None
     if side not in KINDS:
         raise UserError(
-            f"the network takes pictures of {side} pixels a side",
+            f"the network takes pictures of {side if isinstance(side, int) else 'any number of'} pixels a side",
             f"known are {', '.join(f'{k.name} ({n})' for n, k in KINDS.items())}",
             f"give one of these: {file}",
         )
-    return Segmenter(file, session, side)
+    return Segmenter(file, session, side, sum_of(file))
