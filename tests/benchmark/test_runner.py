@@ -4,6 +4,7 @@ for by a copy of the true asset."""
 import json
 import shutil
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -274,8 +275,8 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(tiny, monkeypatch, capsys
 class FakeMeasure:
     """Stands for rendering, reconstruction and evaluation: figures by the object's name."""
 
-    def __init__(self, monkeypatch, stop_at=None):
-        self.done, self.stop_at = [], stop_at
+    def __init__(self, monkeypatch, stop_at=None, seconds=0.0):
+        self.done, self.stop_at, self.seconds = [], stop_at, seconds
         monkeypatch.setattr(runner, "synthesize_item", lambda suite, item, *_: item.name)
         monkeypatch.setattr(runner, "_measured", self.measured)
 
@@ -283,6 +284,7 @@ class FakeMeasure:
         run.mkdir(parents=True)  # as `relit reconstruct` does before it is killed
         if capture == self.stop_at:
             raise KeyboardInterrupt
+        time.sleep(self.seconds)
         self.done.append(capture)
         entry = {"value": float(len(capture)), "unit": "dB", "definition": "length of the name"}
         return {"metrics": {"relit_psnr": entry}, "run": run.name, "capture": capture}
@@ -331,18 +333,15 @@ def test_parts_share_the_objects_and_make_one_result(three, tmp_path, monkeypatc
 
 
 def test_minutes_end_a_call_after_an_object(three, tmp_path, monkeypatch):
-    fake = FakeMeasure(monkeypatch)
-    clock = iter([0.0, 0.0, 50.0, 70.0])  # start, then before each object
-    monkeypatch.setattr(runner.time, "monotonic", lambda: next(clock))
-    options = SuiteOptions(out=tmp_path / "out", device="cpu", share=Share(minutes=1))
-    assert run_suite("three", options)["unfinished"] == ["ccc"] and fake.done == ["a", "bb"]
+    fake = FakeMeasure(monkeypatch, seconds=0.6)
+    options = SuiteOptions(out=tmp_path / "out", device="cpu", share=Share(minutes=0.5 / 60))
+    assert run_suite("three", options)["unfinished"] == ["bb", "ccc"] and fake.done == ["a"]
 
 
 def test_figures_of_two_versions_make_no_record(three, tmp_path, monkeypatch):
     FakeMeasure(monkeypatch)
     options = SuiteOptions(out=tmp_path / "out", device="cpu", share=Share(1, 3))
     run_suite("three", options)
-    monkeypatch.setattr(runner, "state_of_code", lambda: ("0000000", False))
     with pytest.raises(UserError, match="has changed"):
         file = tmp_path / "out" / "results.json"
         file.write_text(

@@ -138,14 +138,13 @@ class Middle:
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_masks_by_a_threshold_are_believed_where_the_segmenter_agrees(monkeypatch, same):
+def test_masks_by_a_threshold_are_believed_where_the_segmenter_agrees(same):
     from relit.capture import mask_sources
 
-    monkeypatch.setattr(mask_sources, "at_hand", lambda: True)
-    monkeypatch.setattr(mask_sources, "segmenter", Middle)
     load = lambda: SimpleNamespace(rgb=np.zeros((80, 120, 3)))  # noqa: E731
     load.path = None
     small = np.zeros((40, 60), np.float32)
     small[(slice(10, 30), slice(15, 45)) if same else (slice(0, 12), slice(0, 60))] = 1
-    doubt = mask_sources._doubt([SimpleNamespace(load=load)] * 5, [small, None, small, small, None])
+    photos = [SimpleNamespace(load=load)] * 5
+    doubt = mask_sources._doubt(photos, [small, None, small, small, None], Middle())
     assert (doubt == "") == same and (same or "in 3 photos" in doubt)

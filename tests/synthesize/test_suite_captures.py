@@ -21,10 +21,9 @@ from relit.errors import UserError
 from relit.evaluate.truth import ceiling_of, load_truth
 from relit.images import read_data, write_linear
 from relit.scene import Material
-from relit.synthesize import surroundings
 from relit.synthesize.collection import octant_hints, plan_shots, synthesize_collection
 from relit.synthesize.flash import settings_of, synthesize_flash
-from relit.synthesize.flash_room import as_plastic, painted
+from relit.synthesize.flash_room import painted, plastic_coat
 from support.lump import lump
 
 TINY = {"views": 4, "test_views": 1, "resolution": 40, "spp": 16, "test_spp": 16}
@@ -97,7 +96,7 @@ def test_paints_move_the_colours_and_maps_keep_their_values():
     assert painted(material, "own") is material
     with pytest.raises(UserError, match="paint"):
         painted(material, "blue")
-    plastic = as_plastic(material)
+    plastic = plastic_coat(material)
     assert plastic.base_color.shape[:2] == plastic.specular.shape == plastic.roughness.shape
 
 
@@ -211,9 +210,7 @@ def test_phone_captures_are_named_by_the_model(files, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_turntable_has_a_ceiling_and_the_settings_that_name_it(files, tmp_path, monkeypatch):
-    monkeypatch.setattr(surroundings, "TEXTURE_SIZE", 128)
-    monkeypatch.setattr(surroundings, "DISC_SIZE", 64)
+def test_a_turntable_has_a_ceiling_and_the_settings_that_name_it(files, tmp_path):
     names = (files / "lump.glb", files / "light.exr")
     options = {**TINY, "elevations": (20, 45), "relights": [files / "other.exr"]}
     out = synthesize_turntable_item(*names, tmp_path / "c", **options)

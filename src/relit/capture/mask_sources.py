@@ -26,7 +26,7 @@ from relit.masks.files import (
     judge,
     read_counted,
 )
-from relit.masks.segment import at_hand, segmenter
+from relit.masks.segment import Segmenter, at_hand, segmenter
 from relit.masks.threshold import Backdrop, black_frame, find_backdrop
 from relit.masks.weights import COMMAND as WEIGHTS_COMMAND
 from relit.scene import Photo
@@ -83,7 +83,8 @@ def masked(
     if wanted in ("auto", "threshold"):
         said: list[str] = []
         result = _from_backdrop(reading, photos, wanted == "threshold", said)
-        doubt = _doubt(photos, result[1]) if result is not None and wanted == "auto" else ""
+        check = _network_at_hand() if result is not None and wanted == "auto" else None
+        doubt = "" if check is None else _doubt(photos, result[1], check)  # pyright: ignore
         notes += [doubt] if doubt else said
         if result is not None and not doubt:
             return result
@@ -120,26 +121,28 @@ def _say_empty(empty: list[str], notes: list[str]) -> None:
         )
 
 
-def _doubt(photos: list[Photo], small: list) -> str:
+def _network_at_hand() -> Segmenter | None:
+    """The segmenter, None where it is missing; a damaged file takes nothing from photos that do not
+    need it."""
+    try:
+        return segmenter() if at_hand() else None
+    except UserError:
+        return None
+
+
+def _doubt(photos: list[Photo], small: list, network: Segmenter) -> str:
     """Why masks by a threshold are not used, '' where they are: a surface that the object lies on can
     pass for a plain backdrop in each photo alone. small: masks (h, w) or None of all photos. They are
-    compared with the segmenter's, where that is at hand, in a few photos."""
-    known = [k for k, m in enumerate(small) if m is not None]
-    if not at_hand() or not known:
-        return ""
-    try:
-        network = segmenter()
-    except UserError:  # a damaged file takes nothing from photos that do not need it
-        return ""
-    overlaps = []
-    for k in known[:: -(-len(known) // COMPARED)]:
+    compared with those of the network in a few photos."""
+    known, overlaps = [k for k, m in enumerate(small) if m is not None], []
+    for k in known[:: max(1, -(-len(known) // COMPARED))]:
         p = photos[k]
         mask = network.kept(p.load.path, lambda p=p: p.load().rgb)
         size = small[k].shape[1::-1]
         other = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5
         own = small[k] > 0.5
         overlaps.append((own & other).sum() / max(int((own | other).sum()), 1))
-    overlap = float(np.median(overlaps))
+    overlap = float(np.median(overlaps)) if overlaps else 1.0
     if overlap >= ALIKE:
         return ""
     return (

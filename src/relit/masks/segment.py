@@ -25,7 +25,7 @@ VERSION = 1  # of what is made of a network's output; part of the names of kept 
 
 
 @dataclass(frozen=True)
-class Kind:
+class NetworkKind:
     """A kind of network. mean, spread: of sRGB codes in [0, 255]; the input is (codes - mean) /
     spread."""
 
@@ -35,8 +35,8 @@ class Kind:
 
 
 KINDS = {  # side of the input in pixels -> kind
-    1024: Kind("IS-Net", (128.0, 128.0, 128.0), (256.0, 256.0, 256.0)),
-    320: Kind(
+    1024: NetworkKind("IS-Net", (128.0, 128.0, 128.0), (256.0, 256.0, 256.0)),
+    320: NetworkKind(
         "U2-Net",
         (0.485 * 255, 0.456 * 255, 0.406 * 255),
         (0.229 * 255, 0.224 * 255, 0.225 * 255),

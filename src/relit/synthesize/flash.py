@@ -34,7 +34,7 @@ from relit.conventions import srgb_from_linear
 from relit.errors import UserError
 from relit.files import write_text
 from relit.scene import Camera, Flash, Material, Mesh
-from relit.synthesize.flash_room import FlashRoom, as_plastic, flash_room, painted, room_light
+from relit.synthesize.flash_room import FlashRoom, flash_room, painted, plastic_coat, room_light
 from relit.synthesize.multiview import (
     claim_folder,
     identity_of,
@@ -133,7 +133,7 @@ def synthesize_flash(
 
     mesh, own = read_asset_file(asset_file, nodes)
     own = painted(own, paint)
-    plastic = plastic_of(mesh, own) if material == "plastic" else as_plastic(own)
+    plastic = plastic_of(mesh, own) if material == "plastic" else plastic_coat(own)
     world_from_asset = object_frame(mesh)
     train = orbit_cameras(views, resolution, seed=seed, prefix="r_")
     test = orbit_cameras(test_views, resolution, seed=seed + 1, prefix="t_")

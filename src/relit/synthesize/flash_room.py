@@ -127,7 +127,7 @@ def painted(material: Material, paint: str) -> Material:
     return replace(material, base_color=DARK * base if paint == "dark" else 1 - BRIGHT * (1 - base))
 
 
-def as_plastic(material: Material) -> Material:
+def plastic_coat(material: Material) -> Material:
     """The rough plastic of the module's text. Maps of different sizes are sampled to the largest."""
     import cv2
 
