@@ -137,7 +137,7 @@ def _doubt(photos: list[Photo], small: list, network: Segmenter) -> str:
     known, overlaps = [k for k, m in enumerate(small) if m is not None], []
     for k in known[:: max(1, -(-len(known) // COMPARED))]:
         p = photos[k]
-        mask = network.kept(p.load.path, lambda p=p: p.load().rgb)
+        mask = network.kept(p.load.path, (p.height, p.width), lambda p=p: p.load().rgb)
         size = small[k].shape[1::-1]
         other = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5
         own = small[k] > 0.5
@@ -157,7 +157,7 @@ def _from_segmenter(reading: Reading, photos: list[Photo], name: str, notes: lis
     network = segmenter(name)
     found, small, began = [], [], time.monotonic()
     for k, p in enumerate(photos):
-        m = network.kept(p.load.path, lambda p=p: p.load().rgb)
+        m = network.kept(p.load.path, (p.height, p.width), lambda p=p: p.load().rgb)
         found.append(photo.with_mask(p, m))
         small.append(_shrunk(m))
         if (took := time.monotonic() - began) > SILENT and sys.stderr.isatty():

@@ -70,18 +70,19 @@ class Segmenter:
         out = np.asarray(self.session.run(None, given)[0], np.float32)
         return np.clip(cv2.resize(out.reshape(self.side, self.side), (w, h)), 0, 1)
 
-    def kept(self, photo: Path, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The mask of a photo from an earlier call, else what it says of `make()` (H, W, 3) linear,
+    def kept(
+        self, photo: Path, shape: tuple[int, int], make: Callable[[], np.ndarray]
+    ) -> np.ndarray:
+        """The mask (H, W) = shape of a photo from an earlier call, else that of `make()` (H, W, 3) linear,
         which is kept in the cache by the contents of the photo and of the network."""
-        rgb = make()
         told = hashlib.sha256(photo.read_bytes())
-        told.update(f"{VERSION} {self.sum} {rgb.shape[:2]}".encode())
+        told.update(f"{VERSION} {self.sum} {shape}".encode())
         file = cache_folder(None) / "masks" / f"{told.hexdigest()[:32]}.png"
         if file.is_file():
             codes = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-            if codes is not None and codes.shape == rgb.shape[:2]:
+            if codes is not None and codes.shape == shape:
                 return codes.astype(np.float32) / 255
-        mask = self(rgb)
+        mask = self(make())
         file.parent.mkdir(parents=True, exist_ok=True)
         part = file.with_name(f".{os.getpid()}-{file.name}")
         cv2.imwrite(str(part), np.round(mask * 255).astype(np.uint8))
