@@ -304,7 +304,7 @@ def test_a_photo_of_a_hundred_megapixels(tmp_path, capsys):
     assert int(done.stdout) < 2000, done.stderr  # MB: the pixels as float32 are 1144
     Image.new("1", (20_000, 10_001)).save(folder / "images/p1.png")
     code, _, err = relit(capsys, "inspect", folder)
-    answered(code, err, 3, "exceeds limit")
+    answered(code, err, 3, "too large: 20000 x 10001")
 
 
 OFFLINE = """

@@ -229,9 +229,11 @@ def test_a_focal_length_is_that_of_the_files(capsys, tmp_path, capture, monkeypa
 
     monkeypatch.setattr(sfm, "find_cameras", find)
     (capture / "transforms.json").unlink()
-    side, count = picture(0).shape[1], len(list((capture / "images").iterdir()))
+    side = picture(0).shape[1]
     last = sorted((capture / "images").iterdir())[-1]
     Image.fromarray(np.repeat(np.repeat(np.array(Image.open(last)), 2, 0), 2, 1)).save(last)
+    # of photos that are the same to the last byte one is used
+    count = len({p.read_bytes() for p in (capture / "images").iterdir()})
     for more in ((), ("--max-side", side // 2)):
         assert (
             relit(

@@ -95,7 +95,7 @@ def test_four_photos_of_forty_are_no_capture(folder, tmp_path):
     for i in range(1, 5):
         (room / f"{i}.png").write_bytes((folder / "images" / f"{i}.png").read_bytes())
     for i in range(36):
-        images.write_srgb(room / f"blank{i}.png", np.full((HEIGHT, WIDTH, 3), 0.4))
+        images.write_srgb(room / f"blank{i}.png", np.full((HEIGHT, WIDTH, 3), 0.1 + 0.02 * i))
     with pytest.raises(UserError, match="too few cameras were found: 4 of 40") as caught:
         find_cameras(
             open_capture(room, masks="none"), workdir=tmp_path / "work", focals=[FOCAL] * 40

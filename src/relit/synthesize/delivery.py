@@ -3,7 +3,7 @@ truth about them.
 
     images/NAME.jpg             8 bit, as stored: EXIF may turn it
     masks/NAME.png              upright, by a segmenter; only with masks
-    transforms.json             cameras of the upright photos, with k1; only with cameras
+    transforms.json             cameras of the photos as stored, with k1; only with cameras
     truth/transforms_train.json, truth/transforms_test.json
                                 true pinhole cameras (no lens), in the world frame
     truth/masks/NAME.png        visible part of the object, upright, distorted as the photo is
@@ -85,12 +85,49 @@ def write_cameras(
 ) -> None:
     """transforms.json where cameras are handed over, and the true ones."""
     suffix = delivery.camera.suffix
-    given = [(f"images/{name}{suffix}", shot.camera) for name, shot in shots]
+    given = [
+        (f"images/{name}{suffix}", stored_camera(shot.camera, shot.orientation))
+        for name, shot in shots
+    ]
     if delivery.cameras:
         write_json_file(out / "transforms.json", transforms_of(given))
     truth = [(f"images/{name}{suffix}", camera) for name, camera in pinholes(shots)]
     write_json_file(out / "truth" / "transforms_train.json", transforms_of(truth))
     write_json_file(out / "truth" / "transforms_test.json", transforms_of(test))
+
+
+# EXIF orientation -> upright camera axes from those of the stored photo (3, 3); other orientations
+# mirror and are not drawn
+STORED_AXES = {
+    1: np.eye(3),
+    3: np.diag([-1.0, -1.0, 1.0]),
+    6: np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+    8: np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+}
+
+
+def stored_camera(camera: Camera, orientation: int) -> Camera:
+    """The camera of a photo as the file holds it, which is what formats of known cameras mean, from
+    that of the upright photo."""
+    turn = STORED_AXES[orientation]
+    pose = np.array(camera.world_from_camera)
+    pose[:3, :3] = pose[:3, :3] @ turn
+    w, h = camera.width, camera.height
+    # the principal point turns about the picture's middle as the axes do
+    off = turn[:2, :2].T @ np.array([camera.cx - w / 2, camera.cy - h / 2])
+    swapped = orientation in (6, 8)
+    w, h = (h, w) if swapped else (w, h)
+    fx, fy = (camera.fy, camera.fx) if swapped else (camera.fx, camera.fy)
+    return replace(
+        camera,
+        width=w,
+        height=h,
+        fx=fx,
+        fy=fy,
+        cx=float(w / 2 + off[0]),
+        cy=float(h / 2 + off[1]),
+        world_from_camera=pose,
+    )
 
 
 def transforms_of(cameras: Sequence[tuple[str, Camera]]) -> dict[str, Any]:
