@@ -141,10 +141,10 @@ class Middle:
 def test_masks_by_a_threshold_are_believed_where_the_segmenter_agrees(same):
     from relit.capture import mask_sources
 
-    load = lambda: SimpleNamespace(rgb=np.zeros((80, 120, 3)))  # noqa: E731
+    load = lambda: SimpleNamespace(mask=found)  # noqa: E731
     load.path = None
-    small = np.zeros((40, 60), np.float32)
-    small[(slice(10, 30), slice(15, 45)) if same else (slice(0, 12), slice(0, 60))] = 1
-    photos = [SimpleNamespace(load=load, height=80, width=120)] * 5
-    doubt = mask_sources._doubt(photos, [small, None, small, small, None], Middle())
+    found = np.zeros((80, 120), np.float32)
+    found[(slice(20, 60), slice(30, 90)) if same else (slice(0, 24), slice(0, 120))] = 1
+    photos = [SimpleNamespace(load=load, height=80, width=120)] * 3
+    doubt = mask_sources._doubt(photos, photos, Middle())
     assert (doubt == "") == same and (same or "in 3 photos" in doubt)

@@ -84,7 +84,7 @@ def masked(
         said: list[str] = []
         result = _from_backdrop(reading, photos, wanted == "threshold", said)
         check = _network_at_hand() if result is not None and wanted == "auto" else None
-        doubt = "" if check is None else _doubt(photos, result[1], check)  # pyright: ignore
+        doubt = "" if check is None else _doubt(photos, result[0], check)  # pyright: ignore
         notes += [doubt] if doubt else said
         if result is not None and not doubt:
             return result
@@ -130,17 +130,14 @@ def _network_at_hand() -> Segmenter | None:
         return None
 
 
-def _doubt(photos: list[Photo], small: list, network: Segmenter) -> str:
+def _doubt(photos: list[Photo], found: list[Photo], network: Segmenter) -> str:
     """Why masks by a threshold are not used, '' where they are: a surface that the object lies on can
-    pass for a plain backdrop in each photo alone. small: masks (h, w) or None of all photos. They are
-    compared with those of the network in a few photos."""
-    known, overlaps = [k for k, m in enumerate(small) if m is not None], []
-    for k in known[:: max(1, -(-len(known) // COMPARED))]:
-        p = photos[k]
+    pass for a plain backdrop in each photo alone. found: the photos with the threshold's masks. They
+    are compared with those of the network in a few photos."""
+    overlaps, step = [], max(1, -(-len(photos) // COMPARED))
+    for p, masked_photo in list(zip(photos, found, strict=True))[::step]:
         mask = network.kept(p.load.path, (p.height, p.width), lambda p=p: p.load().rgb)
-        size = small[k].shape[1::-1]
-        other = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 0.5
-        own = small[k] > 0.5
+        own, other = masked_photo.load().mask > 0.5, mask > 0.5
         overlaps.append((own & other).sum() / max(int((own | other).sum()), 1))
     overlap = float(np.median(overlaps)) if overlaps else 1.0
     if overlap >= ALIKE:
@@ -325,7 +322,10 @@ def _from_backdrop(reading: Reading, photos: list[Photo], asked: bool, notes: li
         None if f.held_out else backdrop(_small(p).rgb)
         for f, p in zip(reading.frames, photos, strict=True)
     ]
-    spilled = np.mean([border_share(m) > SPILL for m in small if m is not None])
+    # at full size, where the texture of a carpet is not averaged away
+    several = training[:: max(1, -(-len(training) // COMPARED))]
+    full = [with_decoder(p, mask=backdrop).load().mask for p in several if not asked]
+    spilled = np.mean([border_share(m) > SPILL for m in full if m is not None]) if full else 0.0
     if not asked and spilled > SPILLED:
         notes.append(
             f"the borders of the photos are nearly of one colour, but masks by a threshold reach them in {spilled:.0%} of the photos: "
