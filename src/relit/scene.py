@@ -238,8 +238,8 @@ class Instance:
     label: its number in the label image. world_from_object: (4, 4) similarity from the asset frame,
     None where it was not registered.
     reason: why not; of one that was, what is uncertain about its pose. photo: number of the photo,
-    from 0, that the label is of. chance_wrong: of its pose, by what a model of the others says; None
-    where it was not asked.
+    from 0, that the label is of. chance_wrong: that its pose is wrong, by its agreement with a model of
+    the other instances; None where it is unknown.
     """
 
     label: int

@@ -8,8 +8,8 @@ with one node for each of them.
 
 An instance that the first photo does not show has the number of the photo whose label it is,
 `"photo": 2`. A registered instance has a reason where its pose is uncertain, and the chance that it
-is wrong, `"chance_wrong": .04`, where it was asked against a model of the others. The object frame is
-the asset frame (the GLB's coordinates after its node transforms), the world that of `cameras.json`.
+is wrong, `"chance_wrong": .04`, by its agreement with a model of the others. The object frame is the
+asset frame (the GLB's coordinates after its node transforms), the world that of `cameras.json`.
 """
 
 from __future__ import annotations

@@ -35,8 +35,8 @@ from relit.files import cache_folder, write_text
 class SuiteOptions:
     """What a run over a suite is asked for.
 
-    split: 'tune' or 'report' (`benchmark.splits`), '' for `Suite.default_split`. assets: folder with `assets` and `envmaps`.
-    cache: folder of the rendered captures. objects: names to limit the suite to. ablate: names of
+    split: 'tune' or 'report' (`benchmark.splits`), '' for `Suite.default_split`. assets: folder
+    with `assets` and `envmaps`. cache: folder of the rendered captures. objects: names to limit the suite to. ablate: names of
     the suite's ablations or `key=value`. out: folder for the runs and the results, by default a new
     one in the cache; in a folder of an earlier call with the same options the measured objects are
     kept and the others follow. share: which part of the objects this call measures, and for how

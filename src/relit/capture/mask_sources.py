@@ -49,6 +49,7 @@ def masked(
     """-> (photos that know their masks, small masks (h, w) or None, True when the background is
     black)."""
     none = [None] * len(photos)
+    network: Segmenter | None = None
     if wanted in ("auto", "alpha") and all(h.alpha for h in headers):
         small = [
             None if f.held_out else _small(p).alpha
@@ -83,16 +84,17 @@ def masked(
     if wanted in ("auto", "threshold"):
         said: list[str] = []
         result = _from_backdrop(reading, photos, wanted == "threshold", said)
-        check = _network_at_hand() if result is not None and wanted == "auto" else None
-        doubt = "" if check is None else _doubt(photos, result[0], check)  # pyright: ignore
+        network = _network_at_hand() if result is not None and wanted == "auto" else None
+        doubt = "" if network is None else _doubt(photos, result[0], network)  # pyright: ignore
         notes += [doubt] if doubt else said
         if result is not None and not doubt:
             return result
     if wanted.startswith("segment"):
-        return (*_from_segmenter(reading, photos, "".join(wanted.split(":", 1)[1:]), notes), False)
-    if wanted == "auto" and at_hand():
+        network = segmenter("".join(wanted.split(":", 1)[1:]))
+        return (*_from_segmenter(reading, photos, network, notes), False)
+    if wanted == "auto" and (network is not None or at_hand()):
         try:
-            return (*_from_segmenter(reading, photos, "", notes), False)
+            return (*_from_segmenter(reading, photos, network or segmenter(), notes), False)
         except UserError as error:
             notes.append(f"the segmenter's masks are not used: {error.what}")
     elif wanted == "auto":
@@ -148,10 +150,9 @@ def _doubt(photos: list[Photo], found: list[Photo], network: Segmenter) -> str:
     )
 
 
-def _from_segmenter(reading: Reading, photos: list[Photo], name: str, notes: list[str]):
+def _from_segmenter(reading: Reading, photos: list[Photo], network: Segmenter, notes: list[str]):
     """(photos, small masks) by a network; masks of earlier calls are read back. Raises UserError
-    where the network is missing, or its masks tell nothing."""
-    network = segmenter(name)
+    where its masks tell nothing."""
     found, small, began = [], [], time.monotonic()
     for k, p in enumerate(photos):
         m = network.kept(p.load.path, (p.height, p.width), lambda p=p: p.load().rgb)

@@ -14,9 +14,9 @@ class DuplicatesOptions:
     """side: pixels of an instance's window in the volume pass. search_rounds: of fit and search for
     all poses. searches: of few objects (up to 8) from the start, until two of them agree.
     regrowths: times that objects which were not sure of their places are taken out and join again.
-    search_effort: coarse models that the search for poses may fit before it ends with what it has,
-    for every two instances (fit/duplicates/poses.py). levels, level_steps, rays: of the volume pass. refine_poses: step of the pose corrections in it
-    (radians, unit lengths). faces,
+    search_effort: the search for poses of N instances ends after N / 2 + 10 times as many coarse
+    models, with the best poses so far (fit/duplicates/poses.py). levels, level_steps, rays: of the
+    volume pass. refine_poses: step of the pose corrections in it (radians, unit lengths). faces,
     texture: of the object. outlines: rounds in which the poses and the mesh follow the labels
     (fit/shape/outlines.py). surface_steps, points,
     directions, light: of the surface pass. gaussians: the light is so many spherical Gaussians

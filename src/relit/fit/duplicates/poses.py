@@ -51,7 +51,7 @@ class PilePoses:
     whose unit sphere holds the object. registered: (N,) bool. axis_only: (N,) bool, not registered
     but right up to a turn about the object's y axis. scores: (N,). turns: (N,) degrees by which a
     registered instance agrees about as well or better with a model of the others, 0 where it does not.
-    chances: (N,) of a pose being wrong (`LeftOut.chance_wrong`), NaN where it was not asked.
+    chances: (N,) of a pose being wrong (`LeftOut.chance_wrong`), NaN where it is unknown.
     contradicted: see `LeftOut`."""
 
     ids: tuple[ViewId, ...]

@@ -1,4 +1,4 @@
-"""Whether the photo bears out the poses of a pile as a whole."""
+"""Whether the photo supports the poses of a pile."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def judge_pile_poses(
     if contradicted:
         run.refuse(
             f"the photo contradicts the poses that were found: {expected}",
-            "asked against a model of the others, most instances agree better with another pose: the objects are not identical, the "
+            "most instances agree better with a model of the others at another pose: the objects are not identical, the "
             "labels are wrong, the object is plain or nearly symmetric, or the sides that are shown lie too far apart",
             "check the label image; add objects, or another photo of the pile",
         )

@@ -1,8 +1,8 @@
-"""What the model of the OTHER instances says of each: the evidence for its pose.
+"""Leave-one-out evidence for the pose of each instance.
 
-An instance in a wrong place has shaped the model that it is compared with, and so agrees with it. A
-model that was fitted without it has no such opinion: the lead of its own pose there over the best
-other one tells whether the photo bears the pose out.
+An instance at a wrong pose bends the model that is fitted to it, and then agrees with that model.
+So each instance is registered against a model that was fitted without it. The difference between
+the score of its own pose there and that of the best other pose is the evidence for its pose.
 """
 
 from __future__ import annotations
@@ -70,17 +70,18 @@ class LeftOut:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the photo contradicts the poses as a whole: left out, most instances agree much
-        less than with a model that they have shaped, and better with other poses. The lead alone does
-        not tell: of a plain body of revolution the others leave out just the side that one shows."""
+        """Whether the photo contradicts the poses as a whole: left out, instances agree much less
+        than with a model that was fitted to them, and better at other poses. The lead alone does not
+        decide: of a plain body of revolution the model of the others lacks just the side that an
+        instance shows."""
         loss = float(np.mean(self.within - self.own))
         lead = np.clip(self.lead, -MOST, MOST).mean()
         return loss > LOSS and lead < BEHIND
 
 
 def leave_out(views: list[InstanceView], poses: np.ndarray, o: Search, seed: int = 0) -> LeftOut:
-    """Ask each instance against a model of the others. poses: (N, 4, 4) object_from_camera, N >= 3.
-    Raises NoShape where the silhouettes have nothing in common."""
+    """Register each instance against a model of the others. poses: (N, 4, 4) object_from_camera,
+    N >= 3. Raises NoShape where the silhouettes have nothing in common."""
     count = len(views)
     own, other, away = np.full(count, -1.0), np.full(count, -1.0), np.zeros(count)
     crops = instance_crops(views)
@@ -89,8 +90,8 @@ def leave_out(views: list[InstanceView], poses: np.ndarray, o: Search, seed: int
     groups = min(FOLDS, count)
     order = np.random.default_rng(seed).permutation(count)
     for fold in range(groups):
-        asked = order[fold::groups].tolist()
-        rest = [k for k in range(count) if k not in asked]
+        left = order[fold::groups].tolist()
+        rest = [k for k in range(count) if k not in left]
         some = [views[k] for k in rest]
         try:
             values = taut_body(some, poses[rest], o.nodes, 0.15, o.depth, crossed=len(rest) > 3)
@@ -101,13 +102,13 @@ def leave_out(views: list[InstanceView], poses: np.ndarray, o: Search, seed: int
         render = albedo_render(model)
         cameras = views_from(directions_around(o.viewpoints, seed), eyes_at(poses[rest]))
         gallery = make_gallery(render, cameras, DETAILED)
-        theirs, mine = [crops[k] for k in asked], chosen_rings(rings, asked)
+        theirs, mine = [crops[k] for k in left], chosen_rings(rings, left)
         refined = {"rings": mine, "parts": DETAILED}
-        near, own[asked] = refine(theirs, poses[asked], render, steps=(0, 4.0, 2.0), **refined)
-        found = look_for([views[k] for k in asked], theirs, gallery, mine, DETAILED, keep=TRIES + 1)
+        near, own[left] = refine(theirs, poses[left], render, steps=(0, 4.0, 2.0), **refined)
+        found = look_for([views[k] for k in left], theirs, gallery, mine, DETAILED, keep=TRIES + 1)
         for n in range(found.poses.shape[1]):
             there, score = refine(theirs, found.poses[:, n], render, steps=(0, 4.0, 2.0), **refined)
-            for i, k in enumerate(asked):
+            for i, k in enumerate(left):
                 turned = rotation_angle(there[i, :3, :3].T @ near[i, :3, :3])
                 if turned < ANOTHER:
                     own[k] = max(own[k], score[i])
